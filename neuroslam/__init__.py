@@ -1,0 +1,30 @@
+"""Brain-inspired SLAM in PyTorch: from a video to a map that can be saved, queried and drawn."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuroslam.brain import NavigationBrain, load_brain, save_brain
+    from neuroslam.config import BrainConfig
+    from neuroslam.runs import run
+    from neuroslam.sensors import open_source
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "NavigationBrain": "neuroslam.brain",
+    "load_brain": "neuroslam.brain",
+    "save_brain": "neuroslam.brain",
+    "BrainConfig": "neuroslam.config",
+    "open_source": "neuroslam.sensors",
+    "run": "neuroslam.runs",
+}
+
+__all__ = ["BrainConfig", "NavigationBrain", "load_brain", "open_source", "run", "save_brain"]
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401
+    """Import the public names when they are first used: ``neuroslam --help`` needs no torch."""
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'neuroslam' has no attribute {name!r}")

@@ -1,0 +1,281 @@
+r"""The dynamics that pose cells, and any other attractor on a torus, share: pure functions."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.cells.convolve import Kernels, Packet, circulant, trim, widen
+from neuroslam.errors import MapError
+from neuroslam.geometry import TWO_PI
+from neuroslam.types import PoseEstimate
+
+
+class Couplings(NamedTuple):
+    """Matrices of one window size that excite, and excite then inhibit, along theta, y and x.
+
+    Attributes:
+        theta: ``[E, -I E]`` side by side, shape ``(a', 2 a)``: the difference in one product.
+        y: ``E`` and ``I E`` stacked, shape ``(2, 1, b', b)``.
+        x: ``E`` and ``I E`` stacked and transposed, shape ``(2, c, c')``.
+    """
+
+    theta: Tensor
+    y: Tensor
+    x: Tensor
+
+
+def couplings(
+    excite: Kernels, inhibit: Kernels, sizes: tuple[int, int, int], shape: tuple[int, int, int]
+) -> Couplings:
+    """Prepare the products of :func:`settle` for a window of ``sizes`` on a torus of ``shape``."""
+    pairs = []
+    for up, down, size, n in zip(excite, inhibit, sizes, shape, strict=True):
+        reach = down.shape[0] // 2
+        alone = torch.nn.functional.pad(up, (reach, reach))
+        # E then I is one kernel, E * I: full convolution of the two.
+        both = torch.nn.functional.conv1d(
+            up[None, None], down.flip(0)[None, None], padding=2 * reach
+        )[0, 0]
+        pairs.append(torch.stack([circulant(alone, size, n), circulant(both, size, n)]))
+    theta, y, x = pairs
+    return Couplings(
+        torch.cat([theta[0], -theta[1]], dim=1).contiguous(),
+        y[:, None].contiguous(),
+        x.transpose(-1, -2).contiguous(),
+    )
+
+
+def settle(
+    packet: Packet, coupled: Couplings, reach: tuple[int, int, int], global_inhibition: float
+) -> Packet:
+    r"""Excite, inhibit, inhibit globally, normalise.
+
+    .. math::
+        P \leftarrow W_e * P, \quad P \leftarrow P - W_i * P, \quad
+        P \leftarrow \frac{[P - \varphi]_+}{\sum [P - \varphi]_+}
+
+    (multisession RatSLAM, Eqs. 1 and 3; :math:`*` is the circular convolution.)
+
+    Args:
+        packet: :math:`P`, values ``(..., a, b, c)``.
+        coupled: Kernels as matrices for windows of this size, from :func:`couplings`.
+        reach: Half width of both kernels together, for theta, y and x.
+        global_inhibition: :math:`\varphi`, activity removed from every cell.
+
+    Returns:
+        Non-negative activity of sum 1 (for each brain of a batch).
+
+    Raises:
+        MapError: If inhibition silenced every cell.
+    """
+    values = packet.values
+    a, b, _ = values.shape[-3:]
+    batch = values.shape[:-3]
+    rows = values.flatten(-3, -2).unsqueeze(-3) @ coupled.x  # (..., 2, a b, c')
+    planes = coupled.y @ rows.unflatten(-2, (a, b))  # (..., 2, a, b', c')
+    field = coupled.theta @ planes.flatten(-4, -3).flatten(-2, -1)  # (..., a', b' c')
+    field = (field - global_inhibition).clamp_min(0.0)
+    total = field.sum((-2, -1), keepdim=True)
+    if bool((total <= 0.0).any()):
+        raise MapError(
+            "pose cells: inhibition silenced every cell; global_inhibition "
+            f"{global_inhibition:g} is above all activity, lower it"
+        )
+    field = (field / total).reshape(
+        *batch, coupled.theta.shape[0], coupled.y.shape[-2], coupled.x.shape[-1]
+    )
+    origin = tuple((o - r) % n for o, r, n in zip(packet.origin, reach, packet.shape, strict=True))
+    settled = Packet(field, origin, packet.shape)
+    return settled if batch else trim(settled)
+
+
+def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Tensor:
+    r"""Return matrices that move activity along a ring by any distance, interpolating linearly.
+
+    .. math:: S_{ij} = [\,1 - |i + f - j - d|_n\,]_+
+
+    where :math:`|\cdot|_n` is the distance on a ring of :math:`n` cells. Columns sum to 1, and
+    activity moves by exactly :math:`d` on average: the gain is 1.
+
+    Args:
+        shift: :math:`d` in cells, shape ``(...)``.
+        first: :math:`f`, how far the first row lies from the first column.
+        n_out: Rows.
+        n_in: Columns.
+        n: Cells in the ring.
+
+    Returns:
+        Shape ``(..., n_out, n_in)``.
+
+    Example:
+        >>> shift_matrix(torch.tensor(0.25), first=0, n_out=2, n_in=1, n=8).flatten().tolist()
+        [0.75, 0.25]
+    """
+    rows = torch.arange(first, first + n_out, dtype=shift.dtype, device=shift.device)
+    columns = torch.arange(n_in, dtype=shift.dtype, device=shift.device)
+    apart = rows[:, None] - columns - shift[..., None, None]
+    apart = apart - n * torch.round(apart / n)
+    return (1.0 - apart.abs()).clamp_min(0.0)
+
+
+def path_integrate(
+    packet: Packet,
+    distance_cells: float | Tensor,
+    turn_cells: float | Tensor,
+    aside_cells: Tensor | tuple[float, float] = (0.0, 0.0),
+) -> Packet:
+    r"""Move every layer along its heading, then turn all layers: activity follows odometry.
+
+    Layer :math:`k` moves by :math:`d` along :math:`\theta_k = 2\pi k / n_\theta` (bilinear), then
+    activity moves along theta (linear). Any distance, backward too; a lap of the torus comes home.
+
+    Args:
+        packet: Values ``(..., a, b, c)``.
+        distance_cells: :math:`d = v\,dt / \text{cell size}`; a number, or ``(...)`` in a batch.
+        turn_cells: :math:`\omega\,dt\,n_\theta / 2\pi`; likewise.
+        aside_cells: x and y by which all layers move besides; two numbers, or ``(..., 2)``.
+
+    Returns:
+        Activity of the same sum.
+    """
+    values = packet.values
+    batched = values.dim() > 3
+    sizes, (n_theta, n_y, n_x) = values.shape[-3:], packet.shape
+    headings = [TWO_PI * (packet.origin[0] + k) / n_theta for k in range(sizes[0])]
+    directions = values.new_tensor(
+        [[math.cos(h) for h in headings], [math.sin(h) for h in headings]]
+    )
+    if batched:  # every brain keeps the whole torus
+        distance = torch.as_tensor(distance_cells, dtype=values.dtype, device=values.device)
+        shifts = distance[..., None, None] * directions
+        shifts = shifts + torch.as_tensor(aside_cells).to(values)[..., None]
+        windows = ((0, n_x), (0, n_y))
+        turn = torch.as_tensor(turn_cells, dtype=values.dtype, device=values.device)
+        first_theta, n_out_theta = 0, n_theta
+    else:
+        shifts = distance_cells * directions
+        if any(aside_cells):
+            shifts = shifts + values.new_tensor(aside_cells)[:, None]
+        windows = tuple(
+            _window(sizes[axis], n, row.min().item(), row.max().item())
+            for axis, n, row in ((2, n_x, shifts[0]), (1, n_y, shifts[1]))
+        )
+        turn = values.new_tensor(turn_cells)
+        first_theta, n_out_theta = _window(sizes[0], n_theta, turn_cells, turn_cells)
+    (first_x, n_out_x), (first_y, n_out_y) = windows
+    along_x = shift_matrix(shifts[..., 0, :], first_x, n_out_x, sizes[2], n_x)
+    along_y = shift_matrix(shifts[..., 1, :], first_y, n_out_y, sizes[1], n_y)
+    moved = along_y @ values @ along_x.transpose(-1, -2)
+    along_theta = shift_matrix(turn, first_theta, n_out_theta, sizes[0], n_theta)
+    turned = (along_theta @ moved.flatten(-2, -1)).unflatten(-1, (n_out_y, n_out_x))
+    o_theta, o_y, o_x = packet.origin
+    origin = ((o_theta + first_theta) % n_theta, (o_y + first_y) % n_y, (o_x + first_x) % n_x)
+    return Packet(turned, origin, packet.shape)
+
+
+def _window(size: int, n: int, low: float, high: float) -> tuple[int, int]:
+    first = math.floor(low)
+    return first, min(size + math.ceil(high) - first, n)
+
+
+def inject(packet: Packet, at: PoseEstimate, energy: float) -> Packet:
+    r"""Add activity at a point between cells, shared by its eight neighbours (trilinear).
+
+    .. math:: \Delta P_{k,j,i} = \delta \, [1-|k-\theta|]_+ [1-|j-y|]_+ [1-|i-x|]_+
+
+    (multisession RatSLAM, Eq. 5.) Activity is renormalised by the next :func:`settle`.
+    """
+    where = (at.theta, at.y, at.x)
+    corner = tuple(math.floor(c) for c in where)
+    packet = widen(packet, tuple(c % n for c, n in zip(corner, packet.shape, strict=True)))
+    added = packet.values.new_tensor(energy)
+    for axis, (c, low) in enumerate(zip(where, corner, strict=True)):
+        weights = packet.values.new_zeros(packet.values.shape[axis])
+        ahead = (low - packet.origin[axis]) % packet.shape[axis]
+        weights[ahead] = 1.0 - (c - low)
+        weights[(ahead + 1) % packet.shape[axis]] = c - low
+        added = added[..., None] * weights
+    return packet._replace(values=packet.values + added)
+
+
+def decode(packet: Packet, radius: int) -> PoseEstimate:
+    r"""Find the dominant packet: the most active cell, then the population vector around it.
+
+    .. math:: \hat x = \frac{n_x}{2\pi} \operatorname{atan2}
+              \Big(\sum_i p_i \sin\tfrac{2\pi i}{n_x}, \sum_i p_i \cos\tfrac{2\pi i}{n_x}\Big)
+
+    over the cells within ``radius`` of the peak on every axis; likewise y and theta.
+
+    Args:
+        packet: Activity of one brain, values ``(a, b, c)``.
+        radius: Cells to each side of the peak.
+
+    Returns:
+        Position in cells, each in ``[0, n)``.
+    """
+    values = packet.values.detach()
+    a, b, c = values.shape
+    peak = int(values.argmax())
+    peaks = (peak // (b * c), peak // c % b, peak % c)
+    whole = [size == n for size, n in zip((a, b, c), packet.shape, strict=True)]
+    if any(whole):  # bring the peak to the middle, so that its neighbourhood does not wrap
+        rolls = [
+            size // 2 - p if w else 0 for size, p, w in zip((a, b, c), peaks, whole, strict=True)
+        ]
+        values = torch.roll(values, rolls, dims=(0, 1, 2))
+        peaks = tuple(p + r for p, r in zip(peaks, rolls, strict=True))
+    else:
+        rolls = (0, 0, 0)
+    lows = [max(0, p - radius) for p in peaks]
+    near = values[
+        lows[0] : peaks[0] + radius + 1,
+        lows[1] : peaks[1] + radius + 1,
+        lows[2] : peaks[2] + radius + 1,
+    ]
+    over_x = near.sum(2)
+    marginals = (over_x.sum(1), over_x.sum(0), near.sum((0, 1)))
+    found = []
+    for marginal, low, p, roll, origin, n in zip(
+        marginals, lows, peaks, rolls, packet.origin, packet.shape, strict=True
+    ):
+        # Relative to the peak: same angle, and no rounding of a whole turn.
+        unit = TWO_PI / n
+        weights = marginal.tolist()
+        s = sum(w * math.sin(unit * (low + i - p)) for i, w in enumerate(weights))
+        co = sum(w * math.cos(unit * (low + i - p)) for i, w in enumerate(weights))
+        found.append((origin + p - roll + math.atan2(s, co) / unit) % n)
+    return PoseEstimate(found[2], found[1], found[0])
+
+
+def decode_batch(packet: Packet, radius: int) -> Tensor:
+    """Find the dominant packet of every brain of a batch; :func:`decode` has the equation.
+
+    Args:
+        packet: Activity of the whole torus, values ``(batch, n_theta, n_y, n_x)``.
+        radius: Cells to each side of the peak.
+
+    Returns:
+        x, y, theta in cells, shape ``(batch, 3)``.
+    """
+    activity = packet.values
+    batch, *shape = activity.shape
+    peak = activity.flatten(1).argmax(1)
+    n_theta, n_y, n_x = shape
+    peaks = torch.stack([peak // (n_y * n_x), peak // n_x % n_y, peak % n_x], dim=1)
+    offsets = torch.arange(-radius, radius + 1, device=activity.device)
+    index = peaks[:, :, None] + offsets  # (batch, 3, 2 radius + 1)
+    sizes = torch.tensor(shape, device=activity.device)
+    index = index % sizes[:, None]
+    brains = torch.arange(batch, device=activity.device)[:, None, None, None]
+    near = activity[
+        brains, index[:, 0, :, None, None], index[:, 1, None, :, None], index[:, 2, None, None, :]
+    ]
+    marginals = torch.stack([near.sum((2, 3)), near.sum((1, 3)), near.sum((1, 2))], dim=1)
+    unit = TWO_PI / sizes.to(activity.dtype)
+    angles = offsets.to(activity.dtype) * unit[:, None]
+    turn = torch.atan2((marginals * angles.sin()).sum(-1), (marginals * angles.cos()).sum(-1))
+    origin = torch.tensor(packet.origin, device=activity.device)
+    found = (peaks + origin + turn / unit) % sizes
+    return found.flip(-1)

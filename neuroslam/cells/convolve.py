@@ -1,0 +1,229 @@
+r"""Circular convolution on a torus with separable kernels, and the packet it is computed on.
+
+Activity of an attractor network is compact: some hundred cells of a hundred thousand. A
+:class:`Packet` keeps the smallest window that holds them, so a step costs the same on any torus.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from neuroslam.errors import MapError
+
+Kernels = tuple[Tensor, Tensor, Tensor]
+"""One odd 1-D kernel for each axis, in the order theta, y, x."""
+
+
+class Packet(NamedTuple):
+    """Activity inside a window of the torus; every cell outside is silent.
+
+    Attributes:
+        values: Shape ``(..., a, b, c)``, a window in theta, y, x; it may have batch dimensions.
+        origin: Torus coordinates of the window's first cell, in ``[0, n)`` on each axis.
+        shape: Size of the torus ``(n_theta, n_y, n_x)``.
+    """
+
+    values: Tensor
+    origin: tuple[int, int, int]
+    shape: tuple[int, int, int]
+
+
+def gaussian_kernel(size: int, std_cells: float, dtype: torch.dtype = torch.float64) -> Tensor:
+    r"""Return the 1-D factor of a normalised Gaussian kernel, sum 1.
+
+    .. math:: w(r) = e^{-r^2 / 2\sigma^2} / \textstyle\sum_r e^{-r^2 / 2\sigma^2}
+
+    The 3-D kernel is the product of three such factors (multisession RatSLAM, Eq. 1).
+
+    Example:
+        >>> [round(w, 3) for w in gaussian_kernel(3, std_cells=1.0).tolist()]
+        [0.274, 0.452, 0.274]
+    """
+    r = torch.arange(size, dtype=torch.float64) - size // 2
+    weights = torch.exp(-(r**2) / (2.0 * std_cells**2))
+    return (weights / weights.sum()).to(dtype)
+
+
+def circulant(kernel: Tensor, n_in: int, n: int) -> Tensor:
+    r"""Return the matrix that convolves ``n_in`` neighbouring cells of a ring of ``n``.
+
+    Row :math:`i` is the cell :math:`i - r` places after the window's first, :math:`r` being half
+    the kernel's width. Rows that would pass once round the ring fall onto their cell.
+
+    Args:
+        kernel: Odd number of weights, at most ``n``.
+        n_in: Cells in the window.
+        n: Cells in the ring.
+
+    Returns:
+        Shape ``(min(n_in + 2 r, n), n_in)``.
+
+    Example:
+        >>> circulant(torch.tensor([1.0, 2.0, 3.0]), n_in=1, n=9).flatten().tolist()
+        [1.0, 2.0, 3.0]
+    """
+    size = kernel.shape[0]
+    n_out = min(n_in + size - 1, n)
+    columns = torch.arange(n_in, device=kernel.device).repeat_interleave(size)
+    rows = (columns + torch.arange(size, device=kernel.device).repeat(n_in)) % n
+    empty = kernel.new_zeros(n_out, n_in)
+    return empty.index_put((rows, columns), kernel.repeat(n_in), accumulate=True)
+
+
+def multiply_axes(values: Tensor, along: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Apply a matrix to each of the last three axes: shapes ``(a', a)``, ``(b', b)``, ``(c', c)``.
+
+    Example:
+        >>> twice = 2.0 * torch.eye(2)
+        >>> multiply_axes(torch.ones(2, 2, 2), (twice, twice, twice)).unique().item()
+        8.0
+    """
+    a, b, _ = values.shape[-3:]
+    in_theta, in_y, in_x = along
+    batch = values.shape[:-3]
+    rows = values.flatten(-3, -2) @ in_x.transpose(-1, -2)
+    planes = in_y @ rows.unflatten(-2, (a, b))
+    out = in_theta @ planes.flatten(-2, -1)
+    return out.reshape(*batch, in_theta.shape[-2], in_y.shape[-2], in_x.shape[-2])
+
+
+def circular_convolve(
+    activity: Tensor,
+    kernels: Kernels,
+    method: Literal["auto", "window", "separable", "dense"] = "auto",
+) -> Tensor:
+    r"""Convolve activity on the torus with a separable kernel.
+
+    .. math:: (W * P)_{k,j,i} = \sum_{c,b,a} w^\theta_c w^y_b w^x_a \,
+              P_{k-c \bmod n_\theta,\; j-b \bmod n_y,\; i-a \bmod n_x}
+
+    Three implementations, equal up to rounding, all of them differentiable:
+    ``window`` multiplies the active window with circulant matrices (fast on a CPU, one brain),
+    ``separable`` runs ``conv1d`` along each axis (batches), ``dense`` is ``conv3d`` with the full
+    kernel, the definition.
+
+    Args:
+        activity: Shape ``(..., n_theta, n_y, n_x)``.
+        kernels: Odd 1-D kernels for theta, y and x.
+        method: ``auto`` takes ``window`` for one brain on the CPU, else ``separable``.
+
+    Returns:
+        Same shape.
+
+    Example:
+        >>> spread = (gaussian_kernel(3, 1.0),) * 3
+        >>> one = torch.zeros(8, 8, 8, dtype=torch.float64); one[0, 0, 0] = 1.0
+        >>> round(circular_convolve(one, spread).sum().item(), 9)
+        1.0
+    """
+    if method == "auto":
+        single = activity.dim() == 3 and activity.device.type == "cpu"
+        method = "window" if single else "separable"
+    if method == "window":
+        packet = to_packet(activity)
+        along = tuple(
+            circulant(kernel, n_in, n)
+            for kernel, n_in, n in zip(kernels, packet.values.shape[-3:], packet.shape, strict=True)
+        )
+        reach = tuple(kernel.shape[0] // 2 for kernel in kernels)
+        return to_dense(_moved(packet, multiply_axes(packet.values, along), reach))
+    batch = activity.shape[:-3]
+    flat = activity.reshape(-1, 1, *activity.shape[-3:])
+    if method == "dense":
+        t, y, x = (kernel.flip(0) for kernel in kernels)  # conv3d correlates
+        weight = t[:, None, None] * y[:, None] * x
+        pad = [kernel.shape[0] // 2 for kernel in reversed(kernels) for _ in range(2)]
+        out = F.conv3d(F.pad(flat, pad, mode="circular"), weight[None, None])
+        return out.reshape(activity.shape)
+    out = flat[:, 0]
+    for axis, kernel in zip((1, 2, 3), kernels, strict=True):
+        last = out.movedim(axis, -1)
+        lines = last.reshape(-1, 1, last.shape[-1])
+        reach = kernel.shape[0] // 2
+        lines = F.conv1d(F.pad(lines, (reach, reach), mode="circular"), kernel.flip(0)[None, None])
+        out = lines.reshape(last.shape).movedim(-1, axis)
+    return out.reshape(*batch, *activity.shape[-3:])
+
+
+def _moved(packet: Packet, values: Tensor, reach: tuple[int, int, int]) -> Packet:
+    origin = tuple((o - r) % n for o, r, n in zip(packet.origin, reach, packet.shape, strict=True))
+    return Packet(values, origin, packet.shape)
+
+
+def to_packet(activity: Tensor) -> Packet:
+    """Take the smallest window that holds all activity; with batch dimensions, the whole torus.
+
+    Args:
+        activity: Shape ``(..., n_theta, n_y, n_x)``.
+
+    Raises:
+        MapError: If no cell is active.
+    """
+    packet = Packet(activity, (0, 0, 0), tuple(activity.shape[-3:]))
+    return packet if activity.dim() > 3 else trim(packet)
+
+
+def to_dense(packet: Packet) -> Tensor:
+    """Put the window back onto the torus; shape ``(..., n_theta, n_y, n_x)``."""
+    values = packet.values
+    pads: list[int] = []
+    for width, n in zip(values.shape[-3:], packet.shape, strict=True):
+        pads = [0, n - width, *pads]
+    return torch.roll(F.pad(values, pads), packet.origin, dims=(-3, -2, -1))
+
+
+def trim(packet: Packet) -> Packet:
+    """Cut silent planes from the window's sides; where it is the whole ring, at the longest gap.
+
+    Raises:
+        MapError: If no cell is active.
+    """
+    values = packet.values.detach()
+    over_x = values.amax(-1)
+    masks = (over_x.amax(1), over_x.amax(0), values.amax((0, 1)))
+    cut, rolls, origin = [], [0, 0, 0], list(packet.origin)
+    for axis, (mask, n) in enumerate(zip(masks, packet.shape, strict=True)):
+        active = [i for i, peak in enumerate(mask.tolist()) if peak != 0.0]
+        if not active:
+            raise MapError(
+                "pose cells: no activity is left; global inhibition is above every cell's "
+                "activity, lower global_inhibition or raise inject_energy"
+            )
+        first, last = active[0], active[-1]
+        if len(mask) == n and last - first + 1 == n:
+            gaps = [b - a for a, b in zip(active, active[1:], strict=False)]
+            widest = max(gaps, default=1)
+            if widest > 1:
+                start = active[gaps.index(widest) + 1]
+                rolls[axis] = -start
+                first, last = 0, n - widest
+                origin[axis] = (origin[axis] + start) % n
+        cut.append(slice(first, last + 1))
+        origin[axis] = (origin[axis] + first) % n
+    kept = packet.values
+    if any(rolls):
+        kept = torch.roll(kept, rolls, dims=(0, 1, 2))
+    return Packet(kept[cut[0], cut[1], cut[2]], tuple(origin), packet.shape)
+
+
+def widen(packet: Packet, cell: tuple[int, int, int], width: int = 2) -> Packet:
+    """Grow the window by silent cells until it holds ``width`` cells from ``cell`` on, each axis."""
+    pads: list[int] = []
+    origin = []
+    sizes = packet.values.shape[-3:]
+    for o, size, c, n in zip(packet.origin, sizes, cell, packet.shape, strict=True):
+        ahead = (c - o) % n  # of the window's first cell
+        after = max(0, ahead + width - size) if size < n else 0
+        before = n - ahead if after else 0
+        if before and before <= after:
+            after = max(0, width - before - size)
+        else:
+            before = 0
+        after = min(after, n - size - before)
+        pads = [before, after, *pads]
+        origin.append((o - before) % n)
+    if not any(pads):
+        return packet
+    return Packet(F.pad(packet.values, pads), tuple(origin), packet.shape)

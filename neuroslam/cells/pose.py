@@ -1,0 +1,269 @@
+"""Pose cells: a belief over x, y and heading that follows odometry and is corrected by views."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from neuroslam.cells.attractor import (
+    Couplings,
+    couplings,
+    decode,
+    decode_batch,
+    inject,
+    path_integrate,
+    settle,
+)
+from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense, to_packet
+from neuroslam.config import PoseCellConfig
+from neuroslam.errors import MapError
+from neuroslam.geometry import TWO_PI
+from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
+
+
+class PoseCellNetwork(nn.Module):
+    """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet is the pose belief.
+
+    :func:`~neuroslam.cells.attractor.settle` and
+    :func:`~neuroslam.cells.attractor.path_integrate` have the mathematics. The state is the
+    window of active cells (buffers ``window`` and ``origin``) and the binding of every view to
+    the pose at which it was learnt (``bindings``).
+
+    Args:
+        config: Size and dynamics.
+        batch: Number of brains side by side; ``None`` for one. A batch integrates motion; it is
+            corrected by setting or adding to ``activity``, and it binds no views.
+
+    Example:
+        >>> cells = PoseCellNetwork(PoseCellConfig(cell_size_m=0.5))
+        >>> start = cells.estimate
+        >>> after = cells.integrate(Motion(v_m_s=1.0, w_rad_s=0.0, dt_s=0.5))
+        >>> round(start.x - after.x, 2), round(start.y - after.y, 2)  # it starts heading along -x
+        (0.99, 0.0)
+    """
+
+    window: Tensor
+    origin: Tensor
+
+    def __init__(self, config: PoseCellConfig, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        self.shape = (config.n_theta, config.n_xy, config.n_xy)
+        dtype = getattr(torch, config.precision)
+        self.bindings = GrowingTable(
+            {name: ((), torch.float64) for name in ("x", "y", "theta")} | {"decay": ((), dtype)}
+        )
+        self.register_buffer("window", torch.ones(1, 1, 1, dtype=dtype))
+        self.register_buffer("origin", torch.zeros(3, dtype=torch.int64))
+        self.last = Scalars(view=NO_TEMPLATE)
+        slip = torch.zeros(3 if batch is None else (batch, 3), dtype=torch.float64)
+        self.register_buffer("slip", slip)
+        self._couplings: dict[tuple[int, int, int], Couplings] = {}
+        self._packet: Packet | None = None
+        self._estimate: PoseEstimate | Tensor | None = None
+        self._injected = False
+        self.register_load_state_dict_pre_hook(_take_window_size)
+        self.reset()
+
+    def reset(self) -> None:
+        """Put all activity into the middle cell, as at the start of a session: heading along -x."""
+        dense = self.window.new_zeros((() if self.batch is None else (self.batch,)) + self.shape)
+        dense[..., self.shape[0] // 2, self.shape[1] // 2, self.shape[2] // 2] = 1.0
+        self.activity = dense
+
+    @property
+    def kernels(self) -> tuple[Kernels, Kernels]:
+        """Excitation and inhibition kernels: the 1-D factors for theta, y and x."""
+        c, like = self.config, {"dtype": torch.float64}
+        place = gaussian_kernel(c.excite_size, c.excite_std_xy, **like)
+        excite = (gaussian_kernel(c.excite_size, c.excite_std_theta, **like), place, place)
+        place = gaussian_kernel(c.inhibit_size, c.inhibit_std_xy, **like)
+        inhibit = (gaussian_kernel(c.inhibit_size, c.inhibit_std_theta, **like), place, place)
+        return excite, inhibit
+
+    @property
+    def packet(self) -> Packet:
+        """The active window and where it lies on the torus."""
+        if self._packet is None:
+            self._packet = Packet(self.window, tuple(self.origin.tolist()), self.shape)
+        return self._packet
+
+    @packet.setter
+    def packet(self, packet: Packet) -> None:
+        self.window = packet.values
+        self.origin = torch.tensor(packet.origin)
+        self._packet = packet
+        self._estimate = None
+
+    @property
+    def activity(self) -> Tensor:
+        """The belief: shape ``([batch,] n_theta, n_y, n_x)``, non-negative, sum 1."""
+        return to_dense(self.packet)
+
+    @activity.setter
+    def activity(self, activity: Tensor) -> None:
+        expected = (() if self.batch is None else (self.batch,)) + self.shape
+        if tuple(activity.shape) != expected:
+            raise MapError(
+                f"PoseCellNetwork: activity has shape {tuple(activity.shape)}, expected {expected}"
+            )
+        self.packet = to_packet(activity.to(self.window))
+        self.slip = torch.zeros_like(self.slip)
+
+    @property
+    def estimate(self) -> PoseEstimate | Tensor:
+        """Centre of the dominant packet in cells; a ``(batch, 3)`` tensor x, y, theta in a batch."""
+        if self._estimate is None:
+            radius = self.config.decode_radius
+            if self.batch is None:
+                self._estimate = decode(self.packet, radius)
+            else:
+                self._estimate = decode_batch(self.packet, radius)
+        return self._estimate
+
+    @property
+    def peak(self) -> float:
+        """Activity of the most active cell: near 0 when the belief is spread."""
+        return self.window.max().item()
+
+    def integrate(self, motion: Motion) -> PoseEstimate | Tensor:
+        """Settle the attractor, move its activity by ``motion`` and return the estimate.
+
+        Args:
+            motion: m/s, rad/s, s; in a batch the first two are tensors of shape ``(batch,)``.
+
+        Raises:
+            MapError: If inhibition silenced every cell.
+        """
+        c = self.config
+        packet = self.packet
+        sizes = tuple(packet.values.shape[-3:])
+        coupled = self._couplings.get(sizes)
+        if coupled is None:
+            coupled = couplings(*self.kernels, sizes, self.shape)
+            coupled = self._couplings[sizes] = Couplings(*(m.to(self.window) for m in coupled))
+        reach = (c.excite_size // 2 + c.inhibit_size // 2,) * 3
+        settled = settle(packet, coupled, reach, c.global_inhibition)
+        before = self.estimate
+        slip = self.slip if c.exact_gain else torch.zeros_like(self.slip)
+        distance = motion.v_m_s * motion.dt_s / c.cell_size_m
+        turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
+        if self.batch is None:
+            aside_x, aside_y, aside_turn = slip.tolist()
+            self.packet = path_integrate(settled, distance, turn + aside_turn, (aside_x, aside_y))
+        else:
+            self.packet = path_integrate(settled, distance, turn + slip[:, 2], slip[:, :2])
+        if c.exact_gain:
+            self._measure_slip(before, distance, turn)
+        return self.estimate
+
+    def _measure_slip(
+        self, before: PoseEstimate | Tensor, distance: float | Tensor, turn: float | Tensor
+    ) -> None:
+        r"""Find how far the estimate stays behind odometry; the next step makes up for it.
+
+        Clipping at zero pulls a moving packet back, by a tenth of its way at 0.1 cell a step.
+        Settling must not move the belief unless a view asks for it, so the slip
+        :math:`s \leftarrow s + \Delta_\text{odometry} - \Delta_\text{estimate}` is fed back,
+        and forgotten where the belief jumped (another packet won) or a view has just injected.
+        """
+        now = self.estimate
+        sizes = (self.shape[2], self.shape[1], self.shape[0])
+        if self.batch is None:
+            heading = TWO_PI * before.theta / self.shape[0]
+            asked = (distance * math.cos(heading), distance * math.sin(heading), turn)
+            errors = [
+                (was + step - is_ + n / 2) % n - n / 2
+                for was, step, is_, n in zip(before, asked, now, sizes, strict=True)
+            ]
+            jumped = self._injected or any(abs(e) > 1.0 for e in errors)
+            slip = (
+                [0.0] * 3
+                if jumped
+                else [s + e for s, e in zip(self.slip.tolist(), errors, strict=True)]
+            )
+            self.slip = torch.tensor(slip, dtype=torch.float64)
+        else:
+            heading = TWO_PI * before[:, 2] / self.shape[0]
+            asked = torch.stack(
+                torch.broadcast_tensors(distance * heading.cos(), distance * heading.sin(), turn),
+                dim=1,
+            )
+            n = torch.tensor(sizes, dtype=before.dtype, device=before.device)
+            errors = (before + asked - now + n / 2) % n - n / 2
+            slip = self.slip + errors.to(self.slip)
+            self.slip = slip.where((errors.abs() <= 1.0).all(1, keepdim=True), 0.0)
+        self._injected = False
+
+    def see(self, view: ViewMatch) -> None:
+        r"""Bind a new view to the present estimate; let a known one inject where it was bound.
+
+        .. math:: \delta = \text{energy} \cdot \tfrac{1}{30} \left(30 - e^{1.2\,\text{decay}}\right)
+
+        while positive. ``decay`` grows each time the same view is seen in a row, and every view
+        recovers by ``restore`` each frame, so that a robot that stands still is not dragged along.
+
+        Raises:
+            MapError: If ``view`` names a template that was never seen as new.
+        """
+        c = self.config
+        decay = self.bindings["decay"]
+        if view.is_new:
+            if view.template != self.bindings.n:
+                raise MapError(
+                    f"PoseCellNetwork: new view {view.template}, expected {self.bindings.n}; "
+                    "views and bindings must come from the same life"
+                )
+            at = self.estimate
+            self.bindings.append(x=at.x, y=at.y, theta=at.theta, decay=c.active_decay)
+            decay = self.bindings["decay"]
+        elif view.template != NO_TEMPLATE:
+            if not 0 <= view.template < self.bindings.n:
+                raise MapError(
+                    f"PoseCellNetwork: view {view.template} is not bound, there are {len(decay)}"
+                )
+            self._inject_known(view)
+        decay.sub_(c.restore).clamp_min_(c.active_decay)
+        self.last.view = view.template
+
+    def _inject_known(self, view: ViewMatch) -> None:
+        c, b = self.config, self.bindings
+        few = b.n < c.inject_after
+        if not (view.template < b.n - c.inject_after or (few and c.inject_while_few)):
+            return
+        if view.template == self.last.view:
+            b["decay"][view.template] += c.active_decay
+        energy = c.inject_energy / 30.0 * (30.0 - math.exp(1.2 * b["decay"][view.template].item()))
+        if energy <= 0.0:
+            return
+        turned = view.relative_heading_rad * c.n_theta / TWO_PI
+        at = PoseEstimate(
+            b["x"][view.template].item(),
+            b["y"][view.template].item(),
+            (b["theta"][view.template].item() + turned) % c.n_theta,
+        )
+        if c.inject_at_cell:
+            at = PoseEstimate(*(math.floor(value) for value in at))
+        self.packet = inject(self.packet, at, energy)
+        self._injected = True
+
+    def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:
+        """Advance one frame: the view injects, the attractor settles, odometry moves it."""
+        self.see(view)
+        return self.integrate(motion)
+
+    def _apply(self, fn: object, recurse: bool = True) -> "PoseCellNetwork":
+        self._couplings.clear()
+        self._packet = self._estimate = None
+        return super()._apply(fn, recurse)
+
+
+def _take_window_size(
+    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    saved = state.get(prefix + "window")
+    if saved is not None:
+        module.window = module.window.new_empty(saved.shape)
+        module._packet = module._estimate = None

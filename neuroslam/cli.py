@@ -1,0 +1,269 @@
+"""The command line: each command parses, calls one function of the library, and prints."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+# A brain's arrays are small: one thread is faster, and the libraries look at this when they load.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from neuroslam.errors import NeuroslamError
+
+if TYPE_CHECKING:
+    from neuroslam.runs import RunSummary
+    from neuroslam.types import StepResult
+
+app = typer.Typer(
+    help="Brain-inspired SLAM: from a video to a map.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+console = Console()
+
+INTERRUPTED = 130
+USER_ERROR = 2
+
+
+class OnBadFrame(StrEnum):
+    """What to do with a frame that cannot be used."""
+
+    stop = "stop"
+    skip = "skip"
+
+
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` wrote.")]
+NoTensorboard = Annotated[bool, typer.Option("--no-tensorboard", help="Write no events/.")]
+Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
+
+
+@app.command("run")
+def run_command(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
+            "or world:NAME."
+        ),
+    ],
+    out: Out,
+    preset: Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
+    ] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value; laid over both.")
+    ] = None,
+    start: Annotated[int, typer.Option(help="First frame.")] = 0,
+    stop: Stop = None,
+    on_bad_frame: Annotated[
+        OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
+    ] = OnBadFrame.stop,
+    no_tensorboard: NoTensorboard = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace an earlier run in the folder.")] = False,
+) -> int:
+    """Map a SOURCE and write the map, the track, figures and the brain into a folder."""
+    from neuroslam.runs import resolve_config, run
+
+    settings = resolve_config(preset, config, tuple(assignments or ()))
+    with _progress(source) as on_step:
+        summary = run(
+            source,
+            out,
+            settings,
+            start=start,
+            stop=stop,
+            on_bad_frame=on_bad_frame.value,
+            tensorboard=not no_tensorboard,
+            overwrite=overwrite,
+            on_step=on_step,
+        )
+    return _report(summary, out, "run")
+
+
+@app.command("resume")
+def resume_command(out: RunFolder, stop: Stop = None, no_tensorboard: NoTensorboard = False) -> int:
+    """Go on where the run in DIR stopped."""
+    from neuroslam.runs import resume
+
+    with _progress(str(out)) as on_step:
+        summary = resume(out, stop=stop, tensorboard=not no_tensorboard, on_step=on_step)
+    return _report(summary, out, "resume")
+
+
+@app.command("demo")
+def demo_command(out: Out = Path("demo")) -> int:
+    """Map an embedded world in two sessions, and show what came of it."""
+    from neuroslam.demo import demo
+
+    with _progress("world:corridor") as on_step:
+        rows = demo(out, on_step)
+    table = Table(title="Two laps of a corridor, brain saved and reloaded between them")
+    table.add_column("what")
+    table.add_column("figure", justify="right")
+    for name, value in rows:
+        table.add_row(name, value)
+    console.print(table)
+    console.print(f"Figures: {out / 'summary.png'}, {out / 'map.png'}; the run: {out}")
+    return 0
+
+
+@app.command("evaluate")
+def evaluate_command(
+    track: Annotated[Path, typer.Argument(help="A run's folder, or a track as a TUM file.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="True track, TUM; a run of a world has its own.")
+    ] = None,
+    align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
+) -> int:
+    """Compare a track with the truth: absolute and relative error."""
+    from neuroslam.runs import evaluate
+
+    table = Table(title=f"{track} against the truth, {align} alignment")
+    for column in ("error", "rmse", "mean", "median", "max", "unit"):
+        table.add_column(column, justify="left" if column in ("error", "unit") else "right")
+    for name, statistics, unit in evaluate(track, truth, align):
+        table.add_row(name, *(f"{value:.4f}" for value in statistics), unit)
+    console.print(table)
+    return 0
+
+
+@app.command("plot")
+def plot_command(
+    out: RunFolder,
+    to: Annotated[Path | None, typer.Option(help="Folder for the figures; DIR itself.")] = None,
+) -> int:
+    """Draw the figures of a run: map, pose cells, counts over time."""
+    from neuroslam.runs import plot
+
+    for path in plot(out, to or out):
+        console.print(str(path))
+    return 0
+
+
+@app.command("presets")
+def presets_command() -> int:
+    """List the presets and what they are for."""
+    from neuroslam.config import preset_folder, preset_names
+
+    table = Table("preset", "for")
+    for name in preset_names():
+        first = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()[0]
+        table.add_row(name, first.lstrip("# "))
+    console.print(table)
+    return 0
+
+
+@app.command("experiment")
+def experiment_command(
+    name: Annotated[str, typer.Argument(help="corridor-loops or view-matching.")],
+    out: Out,
+    data: Annotated[Path, typer.Option(help="Folder of the recordings.")] = Path("../shared/data"),
+) -> int:
+    """Repeat an experiment on real recordings: results.json, a table and figures."""
+    from neuroslam.experiments import run_experiment
+
+    rows = run_experiment(name, data, out)
+    table = Table(*rows[0].keys(), title=name)
+    for row in rows:
+        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+    console.print(table)
+    console.print(f"Written: {out}")
+    return 0
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[["StepResult"], None]]:
+    """Show frames, frames/s, templates and experiences while a run goes."""
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TextColumn("{task.completed:.0f} frames, {task.fields[rate]:.0f}/s"),
+        TextColumn("{task.fields[templates]} templates, {task.fields[experiences]} experiences"),
+        TimeElapsedColumn(),
+    )
+    import time
+
+    shown = Path(name).name or name
+    with Progress(*columns, console=console, transient=True, refresh_per_second=5) as bar:
+        task = bar.add_task(shown, total=None, rate=0.0, templates=0, experiences=0)
+        began, done, last = time.perf_counter(), 0, 0.0
+
+        def on_step(result: "StepResult") -> None:
+            nonlocal done, last
+            done += 1
+            now = time.perf_counter()
+            if now - last > 0.2:
+                last = now
+                bar.update(
+                    task,
+                    completed=done,
+                    rate=done / (now - began),
+                    templates=result.n_templates,
+                    experiences=result.n_experiences,
+                )
+
+        yield on_step
+
+
+def _report(summary: "RunSummary", out: Path, command: str) -> int:
+    figures = summary.to_dict()
+    for note in summary.skipped[:3]:
+        _complain(command, f"skipped: {note}")
+    if len(summary.skipped) > 3:
+        _complain(command, f"skipped: {len(summary.skipped) - 3} more, see metrics.json")
+    console.print(
+        f"{figures['frames']} frames at {figures['frames_per_s']:.0f} frames/s: "
+        f"{figures['templates']} templates, {figures['experiences']} experiences, "
+        f"{figures['links']} links, {figures['loop_closures']} loop closures"
+    )
+    if summary.accuracy:
+        console.print(
+            f"error against the truth (ATE, rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
+            f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
+        )
+    console.print(f"Written: {out}")
+    if summary.failure:
+        _complain(command, f"stopped early: {summary.failure}")
+        return USER_ERROR
+    if summary.interrupted:
+        _complain(command, f"interrupted; go on with: neuroslam resume {out}")
+        return INTERRUPTED
+    return 0
+
+
+def _complain(command: str, text: str) -> None:
+    print(f"neuroslam {command}: {text}", file=sys.stderr)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; 0 is success, 2 a mistake the user can mend, 130 an interruption."""
+    arguments: list[Any] = sys.argv[1:] if argv is None else argv
+    command = arguments[0] if arguments else ""
+    try:
+        return app(args=arguments, standalone_mode=False) or 0
+    except (typer.Abort, KeyboardInterrupt):
+        _complain(command, "interrupted")
+        return INTERRUPTED
+    except typer.TyperException as error:
+        error.show()
+        return USER_ERROR
+    except NeuroslamError as error:
+        _complain(command, str(error))
+        return USER_ERROR
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,405 @@
+"""Every parameter of the brain: name, unit, bounds, what it does; files and presets to set them."""
+
+import configparser
+import difflib
+import math
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from neuroslam.errors import ConfigError
+
+Region = tuple[int, int, int, int]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class OdometryConfig(_Section):
+    """Visual odometry: two image regions, matched with their predecessors (specs: RatSLAM 1)."""
+
+    use: Literal["auto", "visual", "given"] = Field(
+        "auto", description="auto: the source's own odometry where it has one, else visual"
+    )
+    speed_region: Region | None = Field(
+        None, description="x_min, x_max, y_min, y_max in px; none: lower half of the picture"
+    )
+    turn_region: Region | None = Field(
+        None, description="x_min, x_max, y_min, y_max in px; none: upper half of the picture"
+    )
+    max_shift_px: int = Field(40, ge=1, description="largest offset tried; larger: faster turns")
+    fov_deg: float = Field(90.0, gt=0, le=360, description="horizontal view of the whole picture")
+    speed_scaling_m_s: float = Field(
+        100.0, gt=0, description="speed per unit of profile difference; larger: longer map"
+    )
+    max_speed_m_s: float = Field(5.0, gt=0, description="speeds are cut here")
+    min_speed_m_s: float = Field(0.0, ge=0, description="below it the robot stands still")
+    first_frame: Literal["still", "zero_profile"] = Field(
+        "still", description="zero_profile: compared with an all-zero profile, as OpenRatSLAM does"
+    )
+
+
+class ViewConfig(_Section):
+    """Local view cells: how a picture becomes a template and when two are the same place."""
+
+    crop: Region | None = Field(None, description="x_min, x_max, y_min, y_max in px; none: all")
+    template_width: int = Field(60, ge=2)
+    template_height: int = Field(10, ge=1)
+    threshold: float = Field(
+        0.05, gt=0, lt=1, description="largest mean difference that is a match; larger: fewer views"
+    )
+    shift_match: int = Field(4, ge=0, description="columns a forward view may be shifted by")
+    shift_step: int = Field(1, ge=1, description="columns between two shifts that are tried")
+    panoramic: bool = Field(False, description="roll through the full turn, report the heading")
+    normalisation: float = Field(0.5, ge=0, le=1, description="mean grey to scale to; 0: off")
+    patch_radius: int = Field(0, ge=0, description="patch normalisation over +-k px; 0: off")
+    patch_min_std: float = Field(0.0, ge=0, description="flatter patches become 0.5")
+    min_contrast: float = Field(
+        0.01, ge=0, lt=1, description="std of grey below which a frame shows nothing; 0: off"
+    )
+    mean_gate: bool = Field(
+        False, description="skip templates whose mean differs by more than threshold + 0.005"
+    )
+    precision: Literal["uint8", "float64"] = Field(
+        "uint8", description="how a template is kept: one byte a pixel, or eight"
+    )
+
+    @model_validator(mode="after")
+    def _shift_leaves_columns(self) -> Self:
+        if not self.panoramic and 2 * self.shift_match >= self.template_width:
+            raise ValueError(
+                f"shift_match {self.shift_match} leaves no column of template_width "
+                f"{self.template_width}; it must be below half of it"
+            )
+        return self
+
+
+class PoseCellConfig(_Section):
+    """Pose cells: a continuous attractor on the torus ``(n_theta, n_xy, n_xy)``."""
+
+    n_xy: int = Field(21, ge=7)
+    n_theta: int = Field(36, ge=7)
+    cell_size_m: float = Field(0.25, gt=0, description="side of a cell; larger: coarser places")
+    excite_size: int = Field(7, ge=1, description="odd width of the excitation kernel, cells")
+    excite_std_xy: float = Field(1.0, gt=0, description="cells")
+    excite_std_theta: float = Field(1.0, gt=0, description="cells")
+    inhibit_size: int = Field(5, ge=1, description="odd width of the inhibition kernel, cells")
+    inhibit_std_xy: float = Field(2.0, gt=0, description="cells")
+    inhibit_std_theta: float = Field(2.0, gt=0, description="cells")
+    global_inhibition: float = Field(2e-5, ge=0, description="activity taken from every cell")
+    inject_energy: float = Field(
+        0.2, ge=0, description="activity a known view adds; larger: quicker relocalisation"
+    )
+    active_decay: float = Field(
+        1.0, ge=0, description="fatigue added each time the same view is seen in a row"
+    )
+    restore: float = Field(0.05, ge=0, description="fatigue every view loses each frame")
+    inject_after: int = Field(10, ge=0, description="the newest so many views inject nothing")
+    inject_while_few: bool = Field(
+        False,
+        description="inject always while there are fewer views than that, as OpenRatSLAM does",
+    )
+    inject_at_cell: bool = Field(
+        False, description="inject at the cell below the bound pose, as OpenRatSLAM does"
+    )
+    exact_gain: bool = Field(
+        True, description="make up for the pull of settling; off: the packet lags, as OpenRatSLAM's"
+    )
+    create_threshold_cells: float = Field(
+        2.0, gt=0, description="farther than this from a known place is a new one"
+    )
+    decode_radius: int = Field(3, ge=0, description="cells around the peak that are averaged")
+    precision: Literal["float32", "float64"] = "float32"
+
+    @model_validator(mode="after")
+    def _kernels_fit(self) -> Self:
+        for name in ("excite_size", "inhibit_size"):
+            size = getattr(self, name)
+            if size % 2 == 0:
+                raise ValueError(f"{name} is {size}, must be odd: a kernel has a centre")
+            if size > min(self.n_xy, self.n_theta):
+                raise ValueError(f"{name} {size} is wider than the torus")
+        return self
+
+
+class MapConfig(_Section):
+    """Experience map: a graph of places, relaxed until its links agree."""
+
+    initial_heading_deg: float = Field(90.0, description="heading of the robot at the start")
+    solver: Literal["relax", "least_squares"] = Field(
+        "relax", description="relax: the paper's Eq. 8; least_squares: sparse pose graph"
+    )
+    correction: float = Field(
+        0.5, gt=0, le=0.5, description="share of its error by which a link moves each of its ends"
+    )
+    loops: int = Field(20, ge=0, description="relaxation loops a frame, while not at rest")
+    rest_tolerance: float = Field(
+        1e-6, ge=0, description="largest correction (m, rad) of a map at rest"
+    )
+    robust: bool = Field(
+        False, description="least_squares: loops that contradict the others lose their weight"
+    )
+
+
+class BrainConfig(_Section):
+    """Which cell populations a brain has, and every number in them.
+
+    Example:
+        >>> BrainConfig(view={"threshold": 0.04}).view.threshold
+        0.04
+    """
+
+    odometry: OdometryConfig = OdometryConfig()
+    view: ViewConfig = ViewConfig()
+    pose_cells: PoseCellConfig = PoseCellConfig()
+    map: MapConfig = MapConfig()
+    frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
+    max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")
+
+
+# OpenRatSLAM's name -> (section, our name), for the parameters that carry over one to one.
+CLASSIC_NAMES: dict[str, tuple[str, str]] = {
+    "template_x_size": ("view", "template_width"),
+    "template_y_size": ("view", "template_height"),
+    "vt_shift_match": ("view", "shift_match"),
+    "vt_step_match": ("view", "shift_step"),
+    "vt_normalisation": ("view", "normalisation"),
+    "vt_patch_normalise": ("view", "patch_radius"),
+    "vt_min_patch_normalisation_std": ("view", "patch_min_std"),
+    "vt_panoramic": ("view", "panoramic"),
+    "vt_match_threshold": ("view", "threshold"),
+    "vt_active_decay": ("pose_cells", "active_decay"),
+    "pc_dim_xy": ("pose_cells", "n_xy"),
+    "pc_dim_th": ("pose_cells", "n_theta"),
+    "pc_w_e_dim": ("pose_cells", "excite_size"),
+    "pc_w_i_dim": ("pose_cells", "inhibit_size"),
+    "pc_w_e_var": ("pose_cells", "excite_std_xy"),
+    "pc_w_i_var": ("pose_cells", "inhibit_std_xy"),
+    "pc_global_inhib": ("pose_cells", "global_inhibition"),
+    "pc_vt_inject_energy": ("pose_cells", "inject_energy"),
+    "pc_vt_restore": ("pose_cells", "restore"),
+    "pc_cell_x_size": ("pose_cells", "cell_size_m"),
+    "exp_delta_pc_threshold": ("pose_cells", "create_threshold_cells"),
+    "exp_correction": ("map", "correction"),
+    "exp_loops": ("map", "loops"),
+    "exp_initial_em_deg": ("map", "initial_heading_deg"),
+    "camera_fov_deg": ("odometry", "fov_deg"),
+    "vtrans_scaling": ("odometry", "speed_scaling_m_s"),
+    "vtrans_max": ("odometry", "max_speed_m_s"),
+}
+
+_CLASSIC_REGIONS = {
+    "image_crop": ("view", "crop"),
+    "vtrans_image": ("odometry", "speed_region"),
+    "vrot_image": ("odometry", "turn_region"),
+}
+
+# What else a classic file holds that has no meaning without ROS: where topics and media are.
+_CLASSIC_IGNORED = {"topic_root", "media_path", "image_file", "enable", "odom_map", "calibrate"}
+
+
+def preset_folder() -> Path:
+    """Return the folder of the presets: inside an installed package, or at a checkout's top."""
+    inside = Path(__file__).parent / "configs"
+    return inside if inside.is_dir() else Path(__file__).parent.parent / "configs"
+
+
+def preset_names() -> list[str]:
+    """Return the names that ``--preset`` accepts."""
+    return sorted(path.stem for path in preset_folder().glob("*.toml"))
+
+
+def read_preset(name: str) -> dict[str, Any]:
+    """Read a preset of :func:`preset_names` as nested keys and values.
+
+    Raises:
+        ConfigError: If there is no such preset.
+    """
+    if name not in preset_names():
+        raise ConfigError(
+            f"unknown preset {name!r}; there are {', '.join(preset_names())}{_did_you_mean(name, preset_names())}"
+        )
+    return read_config_file(preset_folder() / f"{name}.toml")
+
+
+def read_config_file(path: Path) -> dict[str, Any]:
+    """Read our TOML, or an OpenRatSLAM ``.ini``/``.txt``, as nested keys and values.
+
+    Raises:
+        ConfigError: If the file is missing or cannot be parsed.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"config {path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"config {path}: cannot be read as text ({error})") from None
+    if path.suffix.lower() in (".ini", ".txt"):
+        return _from_classic(text, path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"config {path}: not valid TOML: {error}") from None
+
+
+def _from_classic(text: str, path: Path) -> dict[str, Any]:
+    parser = configparser.ConfigParser(
+        interpolation=None, inline_comment_prefixes=("#", ";"), strict=False
+    )
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        raise ConfigError(
+            f"config {path}: not an OpenRatSLAM file: {str(error).splitlines()[0]}"
+        ) from None
+    values: dict[str, Any] = {}
+    regions: dict[str, dict[str, int]] = {}
+    for section in parser.sections():
+        for key, raw in parser[section].items():
+            prefix = key.removesuffix("_x_min").removesuffix("_x_max")
+            prefix = prefix.removesuffix("_y_min").removesuffix("_y_max")
+            if section in ("draw", "general") or key in _CLASSIC_IGNORED:
+                continue
+            try:
+                number = float(raw)
+            except ValueError:
+                raise ConfigError(
+                    f"config {path}: {key} = {raw!r} in [{section}]; expected a number"
+                ) from None
+            if prefix in _CLASSIC_REGIONS:
+                regions.setdefault(prefix, {})[key.removeprefix(prefix + "_")] = int(number)
+            elif key == "camera_hz":
+                values["frame_rate_hz"] = number
+            elif key in CLASSIC_NAMES:
+                where, name = CLASSIC_NAMES[key]
+                values.setdefault(where, {})[name] = _as_field(where, name, number)
+            else:
+                raise ConfigError(
+                    f"config {path}: unknown key {key!r} in [{section}]"
+                    f"{_did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
+                )
+    for prefix, edges in regions.items():
+        where, name = _CLASSIC_REGIONS[prefix]
+        missing = [e for e in ("x_min", "x_max", "y_min", "y_max") if e not in edges]
+        if missing:
+            raise ConfigError(f"config {path}: {prefix}_{missing[0]} is missing")
+        values.setdefault(where, {})[name] = tuple(
+            edges[e] for e in ("x_min", "x_max", "y_min", "y_max")
+        )
+    cells = values.get("pose_cells", {})
+    for kernel in ("excite", "inhibit"):  # the classic file has one width for place and direction
+        if f"{kernel}_std_xy" in cells:
+            cells[f"{kernel}_std_theta"] = cells[f"{kernel}_std_xy"]
+    if not math.isfinite(values.get("frame_rate_hz", 1.0)):
+        raise ConfigError(f"config {path}: camera_hz is not a finite number")
+    return values
+
+
+def _as_field(section: str, name: str, number: float) -> float | int | bool:
+    annotation = type(getattr(getattr(BrainConfig(), section), name))
+    return annotation(number) if number == int(number) else number
+
+
+def merge_values(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Lay nested values over others; ``over`` wins key by key.
+
+    Example:
+        >>> merge_values({"view": {"threshold": 0.1}}, {"view": {"panoramic": True}})
+        {'view': {'threshold': 0.1, 'panoramic': True}}
+    """
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge_values(merged[key], value) if both else value
+    return merged
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """Turn ``section.key=value`` into nested values; the value is read as TOML, else as text.
+
+    Raises:
+        ConfigError: If there is no ``=``.
+
+    Example:
+        >>> parse_assignment("view.threshold=0.04")
+        {'view': {'threshold': 0.04}}
+    """
+    key, equals, raw = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set {text!r}: expected section.key=value, e.g. view.threshold=0.04")
+    try:
+        value = tomllib.loads(f"value = {raw.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = raw.strip()
+    for part in reversed(key.strip().split(".")):
+        value = {part: value}
+    return value
+
+
+def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
+    """Check nested values and make the config of a brain from them.
+
+    Raises:
+        ConfigError: One line that names the key, what was got and what was expected.
+    """
+    try:
+        return BrainConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(
+                f"{origin}: unknown key {where!r}{_did_you_mean(where, _all_keys())}"
+            ) from None
+        said = first["msg"].removeprefix("Value error, ")
+        said = said[0].lower() + said[1:]
+        raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
+
+
+def _all_keys() -> list[str]:
+    keys = []
+    for name, field in BrainConfig.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            keys += [f"{name}.{key}" for key in section.model_fields]
+        else:
+            keys.append(name)
+    return keys
+
+
+def _did_you_mean(word: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    if not close:  # a key given without its section
+        close = [key for key in known if key.rpartition(".")[2] == word.rpartition(".")[2]][:1]
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def to_toml(config: BrainConfig) -> str:
+    """Write the complete config, as in force, as TOML; reading it back gives the same config.
+
+    Example:
+        >>> build_config(tomllib.loads(to_toml(BrainConfig()))) == BrainConfig()
+        True
+    """
+    lines, sections = [], []
+    for name, value in config.model_dump().items():
+        if isinstance(value, dict):
+            body = [f"{k} = {_toml(v)}" for k, v in value.items() if v is not None]
+            sections.append("\n".join([f"\n[{name}]", *body]))
+        else:
+            lines.append(f"{name} = {_toml(value)}")
+    return "\n".join(lines + sections) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(value)

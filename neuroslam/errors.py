@@ -1,0 +1,29 @@
+"""Errors that a user can mend: who, what was got, what was expected, what to do, in one line."""
+
+
+class NeuroslamError(Exception):
+    """Base of every error that neuroslam raises on purpose; the command line prints it as one line."""
+
+
+class ConfigError(NeuroslamError, ValueError):
+    """A configuration that cannot be used: unknown key, value out of bounds, unreadable file."""
+
+
+class SourceError(NeuroslamError, ValueError):
+    """A video, folder, log or world that cannot be read, or a frame in it that cannot be used."""
+
+
+class BadFrame(SourceError):
+    """One frame that cannot be used; the ones after it may be, if the policy is to skip."""
+
+
+class CheckpointError(NeuroslamError, ValueError):
+    """A brain file that cannot be loaded: truncated, altered, of another version, not a brain."""
+
+
+class MapError(NeuroslamError, ValueError):
+    """An operation that the map or the cells cannot do: an id out of range, activity that died."""
+
+
+class RunError(NeuroslamError, ValueError):
+    """A run directory that cannot be written, resumed or read."""

@@ -1,0 +1,6 @@
+"""The graph of places, how it is made consistent, and ways through it."""
+
+from neuroslam.mapping.experience import ExperienceMap, Links
+from neuroslam.mapping.planning import Plan, quickest_path
+
+__all__ = ["ExperienceMap", "Links", "Plan", "quickest_path"]

@@ -1,0 +1,60 @@
+"""The quickest way through a map."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+
+class Plan(NamedTuple):
+    """A way through the map.
+
+    Attributes:
+        path: Experiences from start to goal, both included; empty if there is no way.
+        duration_s: Time the way took when it was travelled; infinite if there is none.
+        reason: Why there is no way; empty if there is one.
+    """
+
+    path: list[int]
+    duration_s: float
+    reason: str = ""
+
+
+def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) -> Plan:
+    """Find the quickest path by link time, links in both directions (Dijkstra).
+
+    Args:
+        links: ``source``, ``target``, ..., ``duration_s`` last, as in
+            :class:`neuroslam.mapping.experience.Links`.
+        n: Number of experiences.
+        start: Id to start from.
+        goal: Id to reach.
+
+    Returns:
+        The plan; an unreachable goal is said so in ``reason``, nothing is raised.
+
+    Example:
+        >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
+        >>> quickest_path(links, 3, 2, 0).path
+        [2, 1, 0]
+    """
+    for name, experience in (("start", start), ("goal", goal)):
+        if not 0 <= experience < n:
+            return Plan([], np.inf, f"{name} {experience} is not in a map of {n} experiences")
+    source, target, duration = links[0], links[1], links[-1]
+    # csgraph takes a stored 0 for no edge, and coo sums duplicates: keep the quickest of each pair.
+    pairs = np.concatenate([source * n + target, target * n + source])
+    seconds = np.maximum(np.concatenate([duration, duration]), 1e-9)
+    order = np.lexsort((seconds, pairs))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(pairs[order]) != 0
+    pairs, seconds = pairs[order][first], seconds[order][first]
+    graph = coo_array((seconds, (pairs // n, pairs % n)), shape=(n, n)).tocsr()
+    distance, before = dijkstra(graph, indices=start, return_predecessors=True)
+    if not np.isfinite(distance[goal]):
+        return Plan([], np.inf, f"no links lead from experience {start} to {goal}")
+    path = [goal]
+    while path[-1] != start:
+        path.append(int(before[path[-1]]))
+    return Plan(path[::-1], float(distance[goal]))

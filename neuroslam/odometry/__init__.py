@@ -1,0 +1,5 @@
+"""Self-motion from what the robot sees."""
+
+from neuroslam.odometry.visual import VisualOdometry
+
+__all__ = ["VisualOdometry"]

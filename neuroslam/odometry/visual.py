@@ -1,0 +1,231 @@
+"""Visual odometry: how fast the robot drives and turns, from two pictures in a row.
+
+Turning to the left moves the picture to the right: see ``docs/sign_conventions.md``.
+"""
+
+import math
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuroslam.config import OdometryConfig, Region
+from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.storage import Scalars
+from neuroslam.types import Velocity
+
+
+def profile(image: np.ndarray, region: Region) -> np.ndarray:
+    """Return the mean of each column of a region, grey in [0, 1].
+
+    Args:
+        image: ``uint8``, ``(h, w)``.
+        region: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded.
+
+    Returns:
+        ``float64``, ``(x_max - x_min,)``.
+
+    Example:
+        >>> profile(np.array([[0, 255, 0], [0, 0, 0]], np.uint8), (0, 2, 0, 2)).tolist()
+        [0.0, 0.5]
+    """
+    return column_sums(image, region) / (255.0 * (region[3] - region[2]))
+
+
+def column_sums(image: np.ndarray, region: Region) -> np.ndarray:
+    """Return the sum of each column of a region: :func:`profile` before the division, exact.
+
+    Returns:
+        ``int32``, ``(x_max - x_min,)``.
+    """
+    x_min, x_max, y_min, y_max = region
+    part = image[y_min:y_max, x_min:x_max]
+    return cv2.reduce(part, 0, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[0]
+
+
+def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tuple[int, float]:
+    r"""Find the offset at which the previous profile looks most like the present one.
+
+    .. math:: d(s) = \frac{1}{n - |s|} \sum_i |p_t(i) - p_{t-1}(i - s)|, \quad |s| < S
+
+    Args:
+        now: :math:`p_t`, ``(n,)``.
+        previous: :math:`p_{t-1}`, ``(n,)``.
+        max_shift: :math:`S`, at most ``n``.
+
+    Returns:
+        The offset :math:`s` of the smallest :math:`d`, positive where the picture moved to the
+        right, and that :math:`d`. Of equal ones the first in the order 0, -1, ..., -(S-1), 1, ...,
+        S-1 is taken. Sums of integers are exact, so equal ones are found to be equal.
+
+    Example:
+        >>> match_profiles(np.array([9.0, 1, 2, 7, 3]), np.array([1.0, 2, 7, 3, 5]), 3)
+        (1, 0.0)
+    """
+    n = len(now)
+    overlap, counts, shifts, order = _offsets(n, max_shift)
+    padded = np.zeros(n + 2 * (max_shift - 1))
+    padded[max_shift - 1 : max_shift - 1 + n] = previous
+    step = padded.strides[0]
+    shifted = np.ndarray(overlap.shape, padded.dtype, padded, strides=(step, step))
+    differences = np.subtract(shifted, np.asarray(now, np.float64))
+    np.abs(differences, out=differences)
+    totals = np.einsum("ij,ij->i", differences, overlap)
+    means = (totals / counts)[order]
+    best = int(means.argmin())
+    return int(shifts[order[best]]), float(means[best])
+
+
+@lru_cache(maxsize=16)
+def _offsets(n: int, max_shift: int) -> tuple[np.ndarray, ...]:
+    """Which columns overlap, how many, at which shift, row by row; and the order of trial."""
+    shifts = np.arange(max_shift - 1, -max_shift, -1)
+    source = np.arange(n)[None, :] - shifts[:, None]
+    overlap = ((source >= 0) & (source < n)).astype(np.float64)
+    zero = max_shift - 1
+    order = np.concatenate([np.arange(zero, 2 * max_shift - 1), np.arange(zero - 1, -1, -1)])
+    return overlap, overlap.sum(axis=1), shifts, order
+
+
+def motion_from_match(
+    shift_px: int, difference: float, image_width: int, dt_s: float, config: OdometryConfig
+) -> Velocity:
+    r"""Turn an offset and a difference into motion.
+
+    .. math:: \omega = s \cdot \mathrm{fov} / (\mathrm{width} \cdot \Delta t), \quad
+              v = \min(c \cdot d, v_{\max}), \text{ 0 below } v_{\min}
+
+    Args:
+        shift_px: Offset :math:`s` of the turn region, to the right positive.
+        difference: Smallest difference :math:`d` in the speed region, grey in [0, 1].
+        image_width: Of the whole picture, in px.
+        dt_s: Time between the pictures in seconds.
+        config: Field of view, scale :math:`c` and bounds of the speed.
+
+    Example:
+        >>> motion_from_match(8, 0.01, 160, 0.05, OdometryConfig(fov_deg=90))
+        Velocity(v_m_s=1.0, w_rad_s=1.5707963267948966)
+    """
+    w_deg_s = shift_px * config.fov_deg / image_width * (1.0 / dt_s)
+    v = min(difference * config.speed_scaling_m_s, config.max_speed_m_s)
+    # Degrees first: this order of rounding is the reference's, to the last bit.
+    return Velocity(v if v >= config.min_speed_m_s else 0.0, w_deg_s * math.pi / 180.0)
+
+
+class VisualOdometry(nn.Module):
+    """Measures motion by matching each picture with the one before it.
+
+    The column sums of the last picture's two regions are buffers, so ``state_dict`` is complete.
+
+    Example:
+        >>> odometry = VisualOdometry(OdometryConfig(max_shift_px=4))
+        >>> picture = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
+        >>> odometry(picture, dt_s=0.1)  # the first: nothing to compare it with
+        Velocity(v_m_s=0.0, w_rad_s=0.0)
+        >>> odometry(np.roll(picture, 2, axis=1), dt_s=0.1).w_rad_s > 0  # right: it turned left
+        True
+    """
+
+    speed_sums: Tensor
+    turn_sums: Tensor
+
+    def __init__(self, config: OdometryConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.size = Scalars(height=0, width=0)  # zero before the first picture
+        self._regions: tuple[Region, Region] | None = None  # follow from the config and the size
+        self.register_buffer("speed_sums", torch.zeros(0, dtype=torch.int32))
+        self.register_buffer("turn_sums", torch.zeros(0, dtype=torch.int32))
+        self.register_load_state_dict_pre_hook(_resize_to_saved)
+
+    def forward(self, image: np.ndarray, dt_s: float) -> Velocity:
+        """Compare a picture with the one before it and remember it.
+
+        Args:
+            image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+            dt_s: Time since the previous picture in seconds.
+
+        Raises:
+            ConfigError: If a region does not lie in the picture, or is too narrow for the offsets.
+            BadFrame: If the picture is not of the size and kind of those before, or no time passed.
+        """
+        if not dt_s > 0.0:
+            raise BadFrame(f"VisualOdometry: {dt_s} s since the last picture; expected more than 0")
+        if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+            image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise BadFrame(
+                f"VisualOdometry: picture is {image.dtype} {image.shape}; "
+                "expected uint8, (h, w) or (h, w, 3)"
+            )
+        height, width = image.shape
+        first = self.size.height == 0
+        if not first and (height, width) != (self.size.height, self.size.width):
+            raise BadFrame(
+                f"VisualOdometry: picture is {width} x {height} px; expected "
+                f"{self.size.width} x {self.size.height} px as before it"
+            )
+        if self._regions is None:
+            self._regions = regions_in(height, width, self.config)
+        speed_region, turn_region = self._regions
+        speed_sums = column_sums(image, speed_region)
+        turn_sums = column_sums(image, turn_region)
+        if first and self.config.first_frame == "still":
+            velocity = Velocity(0.0, 0.0)
+        else:
+            speed_before = np.zeros_like(speed_sums) if first else self.speed_sums.cpu().numpy()
+            turn_before = np.zeros_like(turn_sums) if first else self.turn_sums.cpu().numpy()
+            max_shift = self.config.max_shift_px
+            shift, _ = match_profiles(turn_sums, turn_before, max_shift)
+            _, difference = match_profiles(speed_sums, speed_before, max_shift)
+            difference /= 255.0 * (speed_region[3] - speed_region[2])
+            velocity = motion_from_match(shift, difference, width, dt_s, self.config)
+        if first:
+            self.size.height, self.size.width = height, width
+        # By way of _buffers: setting an attribute of a module costs more than matching a profile.
+        device = self.speed_sums.device
+        self._buffers["speed_sums"] = torch.from_numpy(speed_sums).to(device)
+        self._buffers["turn_sums"] = torch.from_numpy(turn_sums).to(device)
+        return velocity
+
+
+def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region, Region]:
+    """Return the speed and the turn region of a picture: the config's, or its lower, upper half.
+
+    Raises:
+        ConfigError: If a region does not lie in the picture, or is narrower than ``max_shift_px``.
+
+    Example:
+        >>> regions_in(120, 160, OdometryConfig())
+        ((0, 160, 60, 120), (0, 160, 0, 60))
+    """
+    halves = {
+        "speed_region": (0, width, height // 2, height),
+        "turn_region": (0, width, 0, height // 2),
+    }
+    for name, half in halves.items():
+        region = getattr(config, name) or half
+        x_min, x_max, y_min, y_max = region
+        if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
+            raise ConfigError(
+                f"odometry.{name} = {list(region)} does not lie in a picture of {width} x {height} "
+                "px; expected x_min, x_max, y_min, y_max inside it"
+            )
+        if x_max - x_min < config.max_shift_px:
+            raise ConfigError(
+                f"odometry.max_shift_px = {config.max_shift_px} is more than the {x_max - x_min} "
+                f"columns of {name}; set it to half of them or less"
+            )
+        halves[name] = region
+    return halves["speed_region"], halves["turn_region"]
+
+
+def _resize_to_saved(
+    module: VisualOdometry, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    for name in ("speed_sums", "turn_sums"):
+        saved = state.get(prefix + name)
+        if saved is not None and saved.ndim == 1:  # another shape is left for torch to refuse
+            setattr(module, name, getattr(module, name).new_empty(saved.shape))

@@ -1,0 +1,173 @@
+"""The files of a run: their names and columns are a contract, and nothing else writes them."""
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+import numpy as np
+
+from neuroslam.brain import NavigationBrain
+from neuroslam.config import BrainConfig
+from neuroslam.errors import RunError
+from neuroslam.geometry import integrate_velocities, wrap_angles
+from neuroslam.mapping.experience import Links
+from neuroslam.storage import write_atomically
+from neuroslam.types import Frame, Pose, StepResult
+
+FRAME_COLUMNS = (
+    "frame,time_s,v_m_s,w_rad_s,template,match_error,relative_heading_rad,action,experience,"
+    "x_m,y_m,theta_rad,pose_x,pose_y,pose_theta,n_templates,n_experiences,n_links"
+)
+
+# One row a frame in trace.f64: what trajectory.tum and map.png need and frames.csv lacks.
+TRACE_COLUMNS = (
+    "time_s", "experience", "dx_m", "dy_m", "dtheta_rad", "v_m_s", "w_rad_s", "dt_s",
+    "truth_x_m", "truth_y_m", "truth_theta_rad",
+)  # fmt: skip
+
+
+class RowWriter:
+    """Writes the two files that grow by a row a frame: ``frames.csv`` and ``trace.f64``."""
+
+    def __init__(self, frames: TextIO, trace: BinaryIO) -> None:
+        self.frames, self.trace = frames, trace
+
+    @classmethod
+    @contextlib.contextmanager
+    def create(cls, out: Path) -> Iterator["RowWriter"]:
+        """Start the files of a new run, in place of an earlier one's."""
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            for old in (out / "events").glob("events.out.*"):
+                old.unlink()
+            (out / "brain.safetensors").unlink(missing_ok=True)  # it would not fit the new rows
+            with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
+                frames.write(FRAME_COLUMNS + "\n")
+                yield cls(frames, trace)
+        except OSError as error:
+            raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+
+    @classmethod
+    @contextlib.contextmanager
+    def reopen(cls, out: Path, rows: int) -> Iterator["RowWriter"]:
+        """Go on after ``rows`` rows; whatever a killed run wrote after its last save is cut off."""
+        row_bytes = 8 * len(TRACE_COLUMNS)
+        try:
+            with (
+                (out / "frames.csv").open("r+") as frames,
+                (out / "trace.f64").open("r+b") as trace,
+            ):
+                for done in range(rows + 1):
+                    if not frames.readline().endswith("\n"):
+                        raise RunError(
+                            f"{out}/frames.csv: {max(done - 1, 0)} rows, the brain has seen {rows} "
+                            "frames; cannot resume"
+                        )
+                frames.seek(frames.tell())
+                frames.truncate()
+                if trace.seek(0, os.SEEK_END) < rows * row_bytes:
+                    raise RunError(f"{out}/trace.f64: shorter than the run; cannot resume")
+                trace.truncate(rows * row_bytes)
+                trace.seek(0, os.SEEK_END)
+                yield cls(frames, trace)
+        except FileNotFoundError as error:
+            raise RunError(f"{error.filename}: missing; cannot resume") from None
+
+    def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
+        """Append the rows of one frame."""
+        c = r.cells
+        self.frames.write(
+            f"{r.frame},{r.time_s!r},{r.motion.v_m_s!r},{r.motion.w_rad_s!r},{r.view.template},"
+            f"{r.view.error!r},{r.view.relative_heading_rad!r},{r.action},{r.experience},"
+            f"{r.pose.x_m!r},{r.pose.y_m!r},{r.pose.theta_rad!r},{c.x!r},{c.y!r},{c.theta!r},"
+            f"{r.n_templates},{r.n_experiences},{r.n_links}\n"
+        )
+        truth = frame.truth or (math.nan, math.nan, math.nan)
+        row = (r.time_s, r.experience, *brain.map.offset, *r.motion, *truth)
+        self.trace.write(np.array(row, dtype="<f8").tobytes())
+
+
+def read_trace(out: str | Path) -> dict[str, np.ndarray]:
+    """Read ``trace.f64`` of a run: one array for each of ``TRACE_COLUMNS``.
+
+    Raises:
+        RunError: If there is none.
+    """
+    path = Path(out) / "trace.f64"
+    if not path.is_file():
+        raise RunError(f"{path}: missing; is {out} a run?")
+    rows = np.fromfile(path, dtype="<f8").reshape(-1, len(TRACE_COLUMNS))
+    return {name: rows[:, i] for i, name in enumerate(TRACE_COLUMNS)}
+
+
+def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
+    """Place every frame on the final map: each keeps its offset from its experience.
+
+    Returns:
+        x, y in metres and heading in radians, shape ``(frames, 3)``.
+    """
+    experience = trace["experience"].astype(np.int64)
+    at = np.zeros((len(experience), 3))
+    known = experience >= 0
+    at[known] = brain.map.poses[experience[known]]
+    c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+    x = at[:, 0] + c * trace["dx_m"] - s * trace["dy_m"]
+    y = at[:, 1] + s * trace["dx_m"] + c * trace["dy_m"]
+    return np.column_stack([x, y, wrap_angles(at[:, 2] + trace["dtheta_rad"])])
+
+
+def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndarray:
+    """Dead-reckon the run's odometry from the map's start; shape ``(frames, 3)``."""
+    start = Pose(0.0, 0.0, math.radians(config.map.initial_heading_deg))
+    return integrate_velocities(trace["v_m_s"], trace["w_rad_s"], trace["dt_s"], start)
+
+
+def loop_closures(links: Links) -> int:
+    """Count the links that join experiences not made one after the other."""
+    return int((np.abs(links.target - links.source) > 1).sum())
+
+
+def experiences_csv(brain: NavigationBrain) -> str:
+    """Write the experiences as CSV: id,x_m,y_m,theta_rad,template,first_frame."""
+    table = brain.map.experiences
+    rows = zip(
+        brain.map.poses.tolist(),
+        table["template"].tolist(),
+        table["first_frame"].tolist(),
+        strict=True,
+    )
+    lines = [f"{i},{x!r},{y!r},{t!r},{v},{f}" for i, ((x, y, t), v, f) in enumerate(rows)]
+    return "\n".join(["id,x_m,y_m,theta_rad,template,first_frame", *lines]) + "\n"
+
+
+def links_csv(links: Links) -> str:
+    """Write the links as CSV: from,to,distance_m,heading_rad,facing_rad,duration_s."""
+    rows = zip(*(column.tolist() for column in links), strict=True)
+    lines = [",".join(repr(value) for value in row) for row in rows]
+    return "\n".join(["from,to,distance_m,heading_rad,facing_rad,duration_s", *lines]) + "\n"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+
+
+def read_frames(out: str | Path) -> dict[str, np.ndarray]:
+    """Read the columns of ``frames.csv`` that hold numbers, each as an array.
+
+    Raises:
+        RunError: If there is none, or it is damaged.
+    """
+    path = Path(out) / "frames.csv"
+    names = FRAME_COLUMNS.split(",")
+    numbers = [i for i, name in enumerate(names) if name != "action"]
+    try:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=numbers, ndmin=2)
+    except FileNotFoundError:
+        raise RunError(f"{path}: missing; is {out} a run?") from None
+    except (ValueError, IndexError) as error:
+        raise RunError(f"{path}: damaged ({error})") from None
+    return {names[i]: rows[:, column] for column, i in enumerate(numbers)}

@@ -1,0 +1,92 @@
+"""From what a user names on the command line to a source of frames."""
+
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from neuroslam.errors import SourceError
+from neuroslam.sensors.images import (
+    is_picture,
+    open_folder,
+    open_image_list,
+    open_tar,
+    read_text,
+)
+from neuroslam.sensors.source import Source
+from neuroslam.sensors.tracks import TrackSource, parse_motion, read_track
+from neuroslam.sensors.video import VIDEO_SUFFIXES, VideoSource
+
+DEFAULT_FRAME_RATE_HZ = 20.0
+
+_TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
+_KINDS = (
+    "a video, a folder or tar of pictures, an image list or motion CSV, an .npz or .npy track, "
+    "or world:NAME"
+)
+
+
+def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
+    """Open whatever ``spec`` names.
+
+    ==================================  ========================================================
+    ``drive.avi``, ``.mp4``, ``.mkv``   video
+    ``frames/``, ``frames.tar``,        pictures, beside them times and motion if there are any
+    ``frames.tar.gz``                   (:mod:`neuroslam.sensors.images`)
+    ``list.txt``, ``list.csv``          image list (:mod:`neuroslam.sensors.images`)
+    ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
+    ``rat.npz``, ``path.npy``           positions (:mod:`neuroslam.sensors.tracks`)
+    ``world:NAME``                      a world rendered on the fly
+    ==================================  ========================================================
+
+    Args:
+        spec: A path, or ``kind:name``.
+        frame_rate_hz: Frames per second where the source has no times; ``None``: 20.
+
+    Raises:
+        SourceError: If it is missing, of no known kind, or cannot be read; the line says why.
+
+    Example:
+        >>> open_source("nowhere.avi")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        neuroslam.errors.SourceError: nowhere.avi: no such file or folder; expected a video, ...
+    """
+    rate = DEFAULT_FRAME_RATE_HZ if frame_rate_hz is None else frame_rate_hz
+    if not (math.isfinite(rate) and rate > 0):
+        raise SourceError(f"{spec}: frame rate is {rate} Hz; expected a number above 0")
+    if isinstance(spec, str) and spec.startswith("world:"):
+        from neuroslam.sensors.world import open_world  # only who renders pays for its import
+
+        return open_world(spec)
+    path = Path(spec)
+    try:
+        if not path.exists():
+            raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
+        return _opener(path)(path, rate)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _opener(path: Path) -> Callable[[Path, float], Source]:
+    name = path.name.lower()
+    if path.is_dir():
+        return open_folder
+    if name.endswith(VIDEO_SUFFIXES):
+        return VideoSource
+    if name.endswith(_TAR_SUFFIXES):
+        return open_tar
+    if name.endswith((".csv", ".txt", ".lst")):
+        return _open_table
+    if name.endswith((".npz", ".npy")):
+        return lambda path, rate: TrackSource(read_track(path, rate), rate)
+    what = "is a single picture" if is_picture(name) else "is of no known kind"
+    raise SourceError(f"{path}: {what}; expected {_KINDS}")
+
+
+def _open_table(path: Path, frame_rate_hz: float) -> Source:
+    """Open a text file: an image list if one of its first lines names a picture, else motion."""
+    text = read_text(path)
+    for row in csv.reader(text.splitlines()[:10]):
+        if any(is_picture(word) for field in row for word in field.split()):
+            return open_image_list(path, frame_rate_hz)
+    return TrackSource(parse_motion(text, str(path)), frame_rate_hz)

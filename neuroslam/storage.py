@@ -1,0 +1,170 @@
+"""State that grows or changes every frame, and files that are written whole or not at all."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+
+class GrowingTable(nn.Module):
+    """Columns of equal length that grow by a row: capacity doubles, ``n`` counts the rows in use.
+
+    Each column is a buffer, so ``.to`` moves it. ``state_dict`` holds the used part only, and
+    loading takes over whatever length was saved.
+
+    Args:
+        columns: For each column the shape of one entry (``()`` for a number) and its dtype.
+
+    Example:
+        >>> table = GrowingTable({"x_m": ((), torch.float64)})
+        >>> table.append(x_m=0.5), table.append(x_m=1.5)
+        (0, 1)
+        >>> table["x_m"].tolist()
+        [0.5, 1.5]
+    """
+
+    def __init__(self, columns: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> None:
+        super().__init__()
+        self.n = 0
+        self.columns = tuple(columns)
+        for name, (shape, dtype) in columns.items():
+            self.register_buffer(name, torch.empty((0, *shape), dtype=dtype))
+        self.register_load_state_dict_pre_hook(_resize_to_saved)
+        self.register_state_dict_post_hook(_keep_used_part)
+
+    def append(self, **row: object) -> int:
+        """Add one row, a value for every column, and return its number."""
+        if self.n == self._buffers[self.columns[0]].shape[0]:
+            self.reserve(max(16, 2 * self.n))
+        for name in self.columns:
+            self._buffers[name][self.n] = torch.as_tensor(row[name])
+        self.n += 1
+        return self.n - 1
+
+    def reserve(self, capacity: int) -> None:
+        """Make room for ``capacity`` rows; the rows in use stay."""
+        for name in self.columns:
+            old = self._buffers[name]
+            new = old.new_zeros((capacity, *old.shape[1:]))
+            new[: self.n] = old[: self.n]
+            self._buffers[name] = new
+
+    def replace(self, **columns: Tensor) -> None:
+        """Put whole new columns in place of the old ones, all of them, all of one length."""
+        if set(columns) != set(self.columns):
+            raise ValueError(
+                f"GrowingTable: got columns {sorted(columns)}, has {sorted(self.columns)}"
+            )
+        lengths = {len(value) for value in columns.values()}
+        if len(lengths) != 1:
+            raise ValueError(f"GrowingTable: columns of different lengths {sorted(lengths)}")
+        for name, value in columns.items():
+            old = self._buffers[name]
+            self._buffers[name] = value.to(old).reshape((-1, *old.shape[1:])).clone()
+        self.n = lengths.pop()
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Return the used part of a column, a view: writing to it changes the table."""
+        return self._buffers[name][: self.n]
+
+    def __len__(self) -> int:
+        """Return the number of rows in use."""
+        return self.n
+
+    def __bool__(self) -> bool:
+        """Return True, for an empty table is a table too."""
+        return True
+
+
+def _resize_to_saved(
+    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    for name in module.columns:
+        saved = state.get(prefix + name)
+        if saved is not None:
+            old = module._buffers[name]
+            if saved.shape[1:] == old.shape[1:]:  # another entry shape is left for torch to refuse
+                module._buffers[name] = old.new_empty(saved.shape)
+                module.n = saved.shape[0]
+
+
+def _keep_used_part(
+    module: nn.Module, state: dict[str, Tensor], prefix: str, _metadata: object
+) -> None:
+    for name in module.columns:
+        state[prefix + name] = state[prefix + name][: module.n]
+
+
+class Scalars(nn.Module):
+    """Named numbers that change every frame: Python numbers in use, 0-d tensors in ``state_dict``.
+
+    A tensor operation on a single number costs microseconds; a Python one does not.
+
+    Example:
+        >>> state = Scalars(frame=0, heading_rad=0.5)
+        >>> state.frame += 1
+        >>> {name: value.item() for name, value in state.state_dict().items()}
+        {'frame': 1, 'heading_rad': 0.5}
+    """
+
+    def __init__(self, **values: float) -> None:
+        super().__init__()
+        self.kinds = {name: type(value) for name, value in values.items()}
+        for name, value in values.items():
+            setattr(self, name, value)
+        self.register_state_dict_post_hook(_write_scalars)
+        self.register_load_state_dict_pre_hook(_read_scalars)
+
+
+def _write_scalars(
+    module: nn.Module, state: dict[str, Tensor], prefix: str, _metadata: object
+) -> None:
+    for name, kind in module.kinds.items():
+        dtype = torch.int64 if kind is int else torch.float64
+        state[prefix + name] = torch.tensor(getattr(module, name), dtype=dtype)
+
+
+def _read_scalars(
+    module: nn.Module,
+    state: dict[str, Tensor],
+    prefix: str,
+    _metadata: object,
+    _strict: bool,
+    missing_keys: list[str],
+    *_unused: object,
+) -> None:
+    for name, kind in module.kinds.items():
+        saved = state.pop(prefix + name, None)
+        if saved is None:
+            missing_keys.append(prefix + name)
+        else:
+            setattr(module, name, kind(saved.item()))
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside ``path``, flush it to the disk, and only then give it its name.
+
+    Whatever goes wrong, ``path`` is the old file or the new one, never a part of one.
+
+    Args:
+        path: The file to write or to replace.
+        write: Writes the content to the path it is given.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes it private; a result is not
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

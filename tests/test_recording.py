@@ -1,0 +1,203 @@
+import io
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from neuroslam.cells.pose import PoseCellNetwork
+from neuroslam.config import BrainConfig
+from neuroslam.errors import RunError
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.recording import (
+    NullRecorder,
+    TensorBoardRecorder,
+    activity_picture,
+    frame_beside_template,
+)
+from neuroslam.types import Frame, Motion, StepResult, ViewMatch
+
+N = 25
+
+
+def drive(recorder, n=N):
+    """A short drive of real cells and a real map; the view is a list of pictures."""
+    config = BrainConfig()
+    cells = config.pose_cells
+    templates = []
+    brain = SimpleNamespace(
+        view=SimpleNamespace(n=0, template_image=lambda i: templates[i]),
+        pose_cells=PoseCellNetwork(cells),
+        map=ExperienceMap(config.map, (cells.n_xy, cells.n_xy, cells.n_theta), 2.0),
+    )
+    results = []
+    with recorder:
+        for i in range(n):
+            image = np.random.default_rng(i // 3).integers(0, 255, (120, 160, 3), np.uint8)
+            motion = Motion(1.0, 0.1, 0.1)
+            view = ViewMatch(i // 3, 0.02 * (i % 3) if i else -1.0, 0.0, i % 3 == 0)
+            if view.is_new:
+                templates.append(cv2.resize(image[..., 0], (60, 10)))
+                brain.view.n += 1
+            estimate = brain.pose_cells(motion, view)
+            action, experience = brain.map(motion, view, estimate, i)
+            result = StepResult(
+                frame=i,
+                time_s=0.1 * i,
+                motion=motion,
+                view=view,
+                action=action,
+                experience=experience,
+                pose=brain.map.pose,
+                cells=estimate,
+                n_templates=brain.view.n,
+                n_experiences=brain.map.n,
+                n_links=brain.map.n_links,
+            )
+            recorder.step(result, Frame(i, 0.1 * i, image), brain)
+            results.append((result, brain.pose_cells.peak, image))
+    return results, brain
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("events")
+    recorder = TensorBoardRecorder(folder, scalars_every=5, images_every=10, maps_every=20)
+    results, brain = drive(recorder)
+    events = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
+    events.Reload()
+    return folder, events, results, brain
+
+
+def pixels(event):
+    return np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
+
+
+@pytest.mark.parametrize(
+    ("tag", "value"),
+    [
+        ("view/templates", lambda result, peak: result.n_templates),
+        ("map/experiences", lambda result, peak: result.n_experiences),
+        ("map/links", lambda result, peak: result.n_links),
+        ("cells/peak", lambda result, peak: peak),
+    ],
+)
+def test_curves_hold_what_the_brain_said_every_fifth_frame(recorded, tag, value):
+    _, events, results, _ = recorded
+    points = events.Scalars(tag)
+    assert [point.step for point in points] == [0, 5, 10, 15, 20]
+    for point in points:
+        result, peak, _ = results[point.step]
+        assert point.value == pytest.approx(value(result, peak), rel=1e-6)
+
+
+def test_a_frame_that_was_not_compared_leaves_a_gap_in_the_match_error(recorded):
+    _, events, results, _ = recorded
+    points = events.Scalars("view/match_error")
+    assert [point.step for point in points] == [5, 10, 15, 20]
+    for point in points:
+        assert point.value == pytest.approx(results[point.step][0].view.error, rel=1e-6)
+
+
+def test_the_residual_of_the_map_and_the_speed_are_curves_too(recorded):
+    _, events, _, _ = recorded
+    assert len(events.Scalars("map/largest_correction")) == 5
+    assert all(point.value > 0 for point in events.Scalars("run/frames_per_s"))
+
+
+def test_pictures_are_large_enough_to_see_and_show_the_frame(recorded):
+    _, events, results, _ = recorded
+    views = events.Images("view/frame_and_template")
+    assert [view.step for view in views] == [0, 10, 20]
+    shown = pixels(views[1])
+    assert shown.shape == (240 + 8 + 53, 320, 3)
+    np.testing.assert_array_equal(shown[:240:2, ::2], results[10][2])
+    cells = events.Images("cells/activity")
+    assert [(cell.step, cell.height, cell.width) for cell in cells] == [
+        (0, 210, 428),
+        (10, 210, 428),
+        (20, 210, 428),
+    ]
+
+
+def test_the_map_is_drawn_now_and_then_and_once_more_at_the_end(recorded):
+    _, events, _, _ = recorded
+    maps = events.Images("map/experiences_and_links")
+    assert [drawn.step for drawn in maps] == [20, 24]
+    assert min(pixels(maps[-1]).shape[:2]) >= 500
+
+
+def test_templates_are_in_the_projector_with_a_sprite(recorded):
+    folder, _, _, brain = recorded
+    config = (folder / "projector_config.pbtxt").read_text()
+    assert "00024/templates/tensors.tsv" in config
+    matrix = np.loadtxt(folder / "00024/templates/tensors.tsv", delimiter="\t")
+    assert matrix.shape == (9, 600)
+    np.testing.assert_array_equal(matrix[4], brain.view.template_image(4).ravel())
+    names = (folder / "00024/templates/metadata.tsv").read_text().splitlines()
+    assert names == [f"template {i}" for i in range(9)]
+    with Image.open(folder / "00024/templates/sprite.png") as sprite:
+        assert sprite.size == (3 * 48, 3 * 48)
+
+
+def test_of_many_templates_the_projector_gets_an_even_choice(tmp_path):
+    drive(TensorBoardRecorder(tmp_path, projected=3))
+    names = (tmp_path / "00024/templates/metadata.tsv").read_text().split("\n")
+    assert names[:3] == ["template 0", "template 4", "template 8"]
+
+
+def test_a_brain_without_views_or_pose_cells_is_recorded_too(tmp_path):
+    _, brain = drive(NullRecorder(), n=3)
+    blind = SimpleNamespace(view=None, pose_cells=None, map=brain.map)
+    match = ViewMatch(-1, -1.0, 0.0, False)
+    motion, pose = Motion(0.0, 0.0, 0.1), brain.map.pose
+    result = StepResult(0, 0.0, motion, match, "none", 0, pose, None, 0, 1, 0)
+    with TensorBoardRecorder(tmp_path) as recorder:
+        recorder.step(result, Frame(0, 0.0), blind)
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert events.Tags()["images"] == ["map/experiences_and_links"]
+    assert "cells/peak" not in events.Tags()["scalars"]
+
+
+def test_recording_does_not_change_what_the_brain_does(tmp_path):
+    watched, _ = drive(TensorBoardRecorder(tmp_path, 1, 2, 10))
+    alone, _ = drive(NullRecorder())
+    assert [result for result, *_ in watched] == [result for result, *_ in alone]
+
+
+def test_closing_twice_or_before_the_first_frame_does_no_harm(tmp_path):
+    recorder = TensorBoardRecorder(tmp_path)
+    recorder.close()
+    recorder.close()
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="cannot be written") as caught:
+        TensorBoardRecorder(tmp_path / "file" / "events")
+    assert "\n" not in str(caught.value)
+
+
+def test_in_the_picture_of_the_cells_up_is_y_and_heading():
+    activity = np.zeros((36, 21, 21), np.float32)
+    activity[27, 20, 0] = 1.0  # at the top left from above; at three quarters of the height aside
+    picture = activity_picture(activity)
+    yellow = picture[..., 0] > 200
+    rows, columns = np.nonzero(yellow[:, :210])
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (0, 9, 0, 9)
+    rows, columns = np.nonzero(yellow[:, 218:])
+    assert 210 * 8 / 36 - 1 <= rows.min() <= rows.max() <= 210 * 9 / 36 + 1
+    assert columns.max() == 9
+
+
+def test_a_large_torus_and_silent_cells_are_drawn_too():
+    assert activity_picture(np.zeros((36, 80, 80), np.float32)).shape == (240, 488, 3)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (720, 1280, 3), (30, 360)])
+def test_any_frame_becomes_320_pixels_wide(shape):
+    picture = frame_beside_template(np.zeros(shape, np.uint8), None)
+    assert picture.shape == (round(shape[0] * 320 / shape[1]), 320, 3)
