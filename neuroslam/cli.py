@@ -131,10 +131,10 @@ def evaluate_command(
     from neuroslam.runs import evaluate
 
     table = Table(title=f"{track} against the truth, {align} alignment")
-    for column in ("error", "rmse", "mean", "median", "max", "unit"):
+    for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
-    for name, statistics, unit in evaluate(track, truth, align):
-        table.add_row(name, *(f"{value:.4f}" for value in statistics), unit)
+    for name, found, unit in evaluate(track, truth, align):
+        table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     console.print(table)
     return 0
 

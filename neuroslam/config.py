@@ -139,6 +139,8 @@ class MapConfig(_Section):
     rest_tolerance: float = Field(
         1e-6, ge=0, description="largest correction (m, rad) of a map at rest"
     )
+    sigma_m: float = Field(0.1, gt=0, description="least_squares: how far a link may be off")
+    sigma_rad: float = Field(0.1, gt=0, description="least_squares: and its facing")
     robust: bool = Field(
         False, description="least_squares: loops that contradict the others lose their weight"
     )
@@ -220,7 +222,8 @@ def read_preset(name: str) -> dict[str, Any]:
     """
     if name not in preset_names():
         raise ConfigError(
-            f"unknown preset {name!r}; there are {', '.join(preset_names())}{_did_you_mean(name, preset_names())}"
+            f"unknown preset {name!r}; there are {', '.join(preset_names())}"
+            f"{_did_you_mean(name, preset_names())}"
         )
     return read_config_file(preset_folder() / f"{name}.toml")
 

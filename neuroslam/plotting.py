@@ -25,6 +25,7 @@ from matplotlib.transforms import ScaledTranslation
 from neuroslam import vision
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align, path_length
+from neuroslam.mapping.experience import closes_loop
 from neuroslam.storage import write_atomically
 from neuroslam.types import Pose, PoseEstimate
 
@@ -89,7 +90,7 @@ def plot_map(
 ) -> Figure:
     """Draw the experience map, beside the odometry it was made from.
 
-    A link is a loop closure when it joins experiences that were not created one after the other.
+    A link is a loop closure when it joins experiences that were both known before.
     With ``truth_xy`` the map is drawn where a similarity alignment to the truth puts it, and the
     legend gives the absolute trajectory error (RMSE).
 
@@ -330,7 +331,7 @@ def _draw_map(
     if walls is not None:
         segments = np.asarray(walls).reshape(-1, 2, 2)
         axes.add_collection(LineCollection(segments, colors=WALL, lw=2.5, zorder=1, label="walls"))
-    is_loop = np.abs(links[:, 0] - links[:, 1]) > 1
+    is_loop = closes_loop(links[:, 0], links[:, 1])
     axes.add_collection(
         LineCollection(xy[links[~is_loop]], colors=MAP, lw=0.9, alpha=0.8, zorder=2)
     )

@@ -125,11 +125,6 @@ def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndar
     return integrate_velocities(trace["v_m_s"], trace["w_rad_s"], trace["dt_s"], start)
 
 
-def loop_closures(links: Links) -> int:
-    """Count the links that join experiences not made one after the other."""
-    return int((np.abs(links.target - links.source) > 1).sum())
-
-
 def experiences_csv(brain: NavigationBrain) -> str:
     """Write the experiences as CSV: id,x_m,y_m,theta_rad,template,first_frame."""
     table = brain.map.experiences

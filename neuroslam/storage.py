@@ -118,6 +118,13 @@ class Scalars(nn.Module):
         self.register_state_dict_post_hook(_write_scalars)
         self.register_load_state_dict_pre_hook(_read_scalars)
 
+    def __setattr__(self, name: str, value: object) -> None:
+        """Set a number the short way: nn.Module takes microseconds to see that it is no tensor."""
+        if name in self.__dict__.get("kinds", ()):
+            self.__dict__[name] = value
+        else:
+            super().__setattr__(name, value)
+
 
 def _write_scalars(
     module: nn.Module, state: dict[str, Tensor], prefix: str, _metadata: object

@@ -1,6 +1,7 @@
 r"""The dynamics that pose cells, and any other attractor on a torus, share: pure functions."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,8 @@ from neuroslam.cells.convolve import Kernels, Packet, circulant, trim, widen
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
 from neuroslam.types import PoseEstimate
+
+Headings = list[list[float]]
 
 
 class Couplings(NamedTuple):
@@ -113,11 +116,26 @@ def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Te
         >>> shift_matrix(torch.tensor(0.25), first=0, n_out=2, n_in=1, n=8).flatten().tolist()
         [0.75, 0.25]
     """
-    rows = torch.arange(first, first + n_out, dtype=shift.dtype, device=shift.device)
-    columns = torch.arange(n_in, dtype=shift.dtype, device=shift.device)
-    apart = rows[:, None] - columns - shift[..., None, None]
-    apart = apart - n * torch.round(apart / n)
+    apart = _offsets(first, n_out, n_in, shift.dtype, shift.device) - shift[..., None, None]
+    if n_out == n:  # the only case in which two cells are near each other the other way round
+        apart = apart - n * torch.round(apart / n)
     return (1.0 - apart.abs()).clamp_min(0.0)
+
+
+@lru_cache(maxsize=256)
+@torch.inference_mode(mode=False)
+def _offsets(first: int, n_out: int, n_in: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    rows = torch.arange(first, first + n_out, dtype=dtype, device=device)
+    return rows[:, None] - torch.arange(n_in, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=16)
+@torch.inference_mode(mode=False)
+def _headings(n_theta: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Headings]:
+    """Cosine and sine of every layer's heading, twice round, as a tensor and as numbers."""
+    angles = [TWO_PI * k / n_theta for k in range(2 * n_theta)]
+    both = [[math.cos(a) for a in angles], [math.sin(a) for a in angles]]
+    return torch.tensor(both, dtype=dtype, device=device), both
 
 
 def path_integrate(
@@ -143,10 +161,9 @@ def path_integrate(
     values = packet.values
     batched = values.dim() > 3
     sizes, (n_theta, n_y, n_x) = values.shape[-3:], packet.shape
-    headings = [TWO_PI * (packet.origin[0] + k) / n_theta for k in range(sizes[0])]
-    directions = values.new_tensor(
-        [[math.cos(h) for h in headings], [math.sin(h) for h in headings]]
-    )
+    layers = slice(packet.origin[0], packet.origin[0] + sizes[0])
+    table, numbers = _headings(n_theta, values.dtype, values.device)
+    directions = table[:, layers]
     if batched:  # every brain keeps the whole torus
         distance = torch.as_tensor(distance_cells, dtype=values.dtype, device=values.device)
         shifts = distance[..., None, None] * directions
@@ -158,10 +175,10 @@ def path_integrate(
         shifts = distance_cells * directions
         if any(aside_cells):
             shifts = shifts + values.new_tensor(aside_cells)[:, None]
-        windows = tuple(
-            _window(sizes[axis], n, row.min().item(), row.max().item())
-            for axis, n, row in ((2, n_x, shifts[0]), (1, n_y, shifts[1]))
-        )
+        windows = []
+        for axis, n, row, aside in zip((2, 1), (n_x, n_y), numbers, aside_cells, strict=True):
+            ends = [distance_cells * end + aside for end in (min(row[layers]), max(row[layers]))]
+            windows.append(_window(sizes[axis], n, min(ends), max(ends)))
         turn = values.new_tensor(turn_cells)
         first_theta, n_out_theta = _window(sizes[0], n_theta, turn_cells, turn_cells)
     (first_x, n_out_x), (first_y, n_out_y) = windows
@@ -262,7 +279,7 @@ def decode_batch(packet: Packet, radius: int) -> Tensor:
     activity = packet.values
     batch, *shape = activity.shape
     peak = activity.flatten(1).argmax(1)
-    n_theta, n_y, n_x = shape
+    _, n_y, n_x = shape
     peaks = torch.stack([peak // (n_y * n_x), peak // n_x % n_y, peak % n_x], dim=1)
     offsets = torch.arange(-radius, radius + 1, device=activity.device)
     index = peaks[:, :, None] + offsets  # (batch, 3, 2 radius + 1)

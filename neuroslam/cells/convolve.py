@@ -4,6 +4,7 @@ Activity of an attractor network is compact: some hundred cells of a hundred tho
 :class:`Packet` keeps the smallest window that holds them, so a step costs the same on any torus.
 """
 
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -193,7 +194,7 @@ def trim(packet: Packet) -> Packet:
             )
         first, last = active[0], active[-1]
         if len(mask) == n and last - first + 1 == n:
-            gaps = [b - a for a, b in zip(active, active[1:], strict=False)]
+            gaps = [b - a for a, b in pairwise(active)]
             widest = max(gaps, default=1)
             if widest > 1:
                 start = active[gaps.index(widest) + 1]
@@ -209,7 +210,7 @@ def trim(packet: Packet) -> Packet:
 
 
 def widen(packet: Packet, cell: tuple[int, int, int], width: int = 2) -> Packet:
-    """Grow the window by silent cells until it holds ``width`` cells from ``cell`` on, each axis."""
+    """Grow the window by silent cells until it holds ``width`` cells from ``cell`` on."""
     pads: list[int] = []
     origin = []
     sizes = packet.values.shape[-3:]

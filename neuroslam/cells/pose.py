@@ -92,10 +92,11 @@ class PoseCellNetwork(nn.Module):
 
     @packet.setter
     def packet(self, packet: Packet) -> None:
-        self.window = packet.values
-        self.origin = torch.tensor(packet.origin)
-        self._packet = packet
-        self._estimate = None
+        # Not self.window = ...: nn.Module takes several microseconds over each.
+        self._buffers["window"] = packet.values
+        self._buffers["origin"] = torch.tensor(packet.origin)
+        self.__dict__["_packet"] = packet
+        self.__dict__["_estimate"] = None
 
     @property
     def activity(self) -> Tensor:
@@ -114,7 +115,7 @@ class PoseCellNetwork(nn.Module):
 
     @property
     def estimate(self) -> PoseEstimate | Tensor:
-        """Centre of the dominant packet in cells; a ``(batch, 3)`` tensor x, y, theta in a batch."""
+        """Centre of the dominant packet in cells; in a batch x, y, theta, shape ``(batch, 3)``."""
         if self._estimate is None:
             radius = self.config.decode_radius
             if self.batch is None:
@@ -142,8 +143,12 @@ class PoseCellNetwork(nn.Module):
         sizes = tuple(packet.values.shape[-3:])
         coupled = self._couplings.get(sizes)
         if coupled is None:
-            coupled = couplings(*self.kernels, sizes, self.shape)
-            coupled = self._couplings[sizes] = Couplings(*(m.to(self.window) for m in coupled))
+            with torch.inference_mode(mode=False):  # kept for steps that may want gradients
+                made = couplings(*self.kernels, sizes, self.shape)
+                coupled = Couplings(
+                    *(m.to(device=self.window.device, dtype=self.window.dtype) for m in made)
+                )
+            self._couplings[sizes] = coupled
         reach = (c.excite_size // 2 + c.inhibit_size // 2,) * 3
         settled = settle(packet, coupled, reach, c.global_inhibition)
         before = self.estimate

@@ -9,7 +9,7 @@ from torch import nn
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI, wrap_angle
+from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.planning import Plan, quickest_path
 from neuroslam.mapping.relax import Relaxation
@@ -61,6 +61,18 @@ _EXPERIENCE_COLUMNS = {
     "template": ((), torch.int64),
     "first_frame": ((), torch.int64),
 }
+
+
+def closes_loop(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Tell which links join places that were both known: not the way on which one was found.
+
+    Example:
+        >>> closes_loop(np.array([0, 1, 2]), np.array([1, 2, 0])).tolist()
+        [False, False, True]
+    """
+    first = np.zeros(len(target), dtype=bool)
+    first[np.unique(target, return_index=True)[1]] = True
+    return ~(first & (target > source))
 
 
 def choose_action(
@@ -303,8 +315,17 @@ class ExperienceMap(nn.Module):
             return 0.0
         poses = self.experiences["pose"]
         if c.solver == "least_squares":
-            solved, _ = solve_pose_graph(poses.numpy(), *self.links[:5], robust=c.robust)
-            s.largest_correction = float(np.abs(solved - poses.numpy()).max())
+            links = self.links
+            solved, _ = solve_pose_graph(
+                poses.numpy(),
+                *links[:5],
+                sigma_m=c.sigma_m,
+                sigma_rad=c.sigma_rad,
+                doubtful=closes_loop(*links[:2]) if c.robust else None,
+            )
+            moved = solved - poses.numpy()
+            moved[:, 2] = wrap_angles(moved[:, 2])
+            s.largest_correction = float(np.abs(moved).max())
             s.at_rest = 1  # it is solved; the next new link wakes it
         else:
             if self._relaxation is None:
@@ -330,7 +351,7 @@ class ExperienceMap(nn.Module):
         return np.unique(near).tolist()
 
     def distance_and_bearing(self, experience: int) -> tuple[float, float]:
-        """Return how far an experience is (m) and in which direction from the robot's heading (rad).
+        """Return how far an experience is (m), and its direction relative to the robot's (rad).
 
         Raises:
             MapError: If there is no such experience.

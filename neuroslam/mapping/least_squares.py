@@ -23,13 +23,20 @@ FIRST_TRIED = 16
 """Doubtful links that are tried at first."""
 
 GROWTH = 1.5
-"""Every later round tries so many times more of them."""
+"""Every later stage tries so many times more of them."""
+
+ROUNDS = 10
+"""Times that a stage judges its links at most; it ends when the verdicts stay the same."""
 
 MAPS_SAMPLED = 32
 """Maps that are drawn to learn how uncertain the map is."""
 
 FALSE_ALARM = 0.01
 """Share of the right links that the gate turns away."""
+
+
+LEAST_GAIN = 1e-9
+"""A step that lowers the cost by a smaller share of it is the last."""
 
 
 class LeastSquaresReport(NamedTuple):
@@ -39,7 +46,7 @@ class LeastSquaresReport(NamedTuple):
         iterations: Linear systems solved for a step.
         cost: :math:`\sum w \lVert r \rVert^2` at the end.
         weights: :math:`w` of every link, shape ``(links,)``; 0 where it was disbelieved.
-        converged: The last step was below the tolerance.
+        converged: The last step was below the tolerance, or gained next to nothing.
     """
 
     iterations: int
@@ -107,23 +114,20 @@ def solve_pose_graph(
         MapError: If a link ends outside the map, or a number is not finite.
 
     Example:
-        >>> square = np.zeros((4, 3))
+        >>> heap = np.zeros((4, 3))  # four poses on one spot, a quarter turn apart
+        >>> heap[:, 2] = [0.0, np.pi / 2, np.pi, 3 * np.pi / 2]
         >>> turn = np.full(4, np.pi / 2)
         >>> solved, report = solve_pose_graph(
-        ...     square, np.arange(4), np.array([1, 2, 3, 0]), np.ones(4), np.zeros(4), turn
+        ...     heap, np.arange(4), np.array([1, 2, 3, 0]), np.ones(4), np.zeros(4), turn
         ... )
         >>> solved[2, :2].round(6).tolist(), round(report.cost, 9)
         ([1.0, 1.0], 0.0)
     """
     poses = np.array(poses, dtype=np.float64)
-    links = _Links(
-        source,
-        target,
-        np.stack(
-            [distance_m * np.cos(heading_rad), distance_m * np.sin(heading_rad), facing_rad], axis=1
-        ),
-        np.empty((len(source), 3)),
-    )
+    with np.errstate(invalid="ignore"):  # _check says which link is infinite
+        ahead, aside = distance_m * np.cos(heading_rad), distance_m * np.sin(heading_rad)
+    measured = np.stack([ahead, aside, facing_rad], axis=1)
+    links = _Links(source, target, measured, np.empty_like(measured))
     links.scale[:, :2] = np.reshape(1.0 / np.asarray(sigma_m, dtype=np.float64), (-1, 1))
     links.scale[:, 2] = 1.0 / np.asarray(sigma_rad, dtype=np.float64)
     unknown = np.isnan(facing_rad)
@@ -145,7 +149,7 @@ def _check(poses: np.ndarray, links: _Links) -> None:
     ends = np.concatenate([links.source, links.target])
     if len(ends) and not 0 <= ends.min() <= ends.max() < len(poses):
         raise MapError(
-            f"solve_pose_graph: a link ends at pose {ends.min() if ends.min() < 0 else ends.max()}, "
+            f"solve_pose_graph: links end at poses {ends.min()} to {ends.max()}, "
             f"expected 0 to {len(poses) - 1}"
         )
     for name, values in (("pose", poses), ("link", links.measured), ("link's sigma", links.scale)):
@@ -206,32 +210,61 @@ def _factor(normal: sparse.csc_array, damping: float) -> SuperLU:
     )
 
 
+def _turn_then_place(poses: np.ndarray, links: _Links) -> np.ndarray:
+    """Solve for the headings alone, then for the places: two linear problems, a good beginning."""
+    n = len(poses)
+    ends = np.concatenate([links.source, links.target])
+    rows = np.tile(np.arange(len(links.source)), 2)
+    signs = np.repeat([-1.0, 1.0], len(links.source)) * (ends > 0)
+    difference = sparse.csr_array((signs, (rows, ends)), shape=(len(links.source), n))
+    seen_from, seen = poses[links.source], links.measured
+
+    def least(values: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        scaled = sparse.diags_array(scale) @ difference
+        return _factor(scaled.T @ scaled, 0.0).solve(scaled.T @ (values.T * scale).T)
+
+    # sought as corrections of the poses, so that whole turns and the first pose stay as they are
+    turn = wrap_angles(seen[:, 2] - poses[links.target, 2] + seen_from[:, 2])
+    theta = poses[:, 2] + least(turn, links.scale[:, 2])
+    cos, sin = np.cos(theta[links.source]), np.sin(theta[links.source])
+    away = np.stack([cos * seen[:, 0] - sin * seen[:, 1], sin * seen[:, 0] + cos * seen[:, 1]], 1)
+    away -= poses[links.target, :2] - seen_from[:, :2]
+    places = poses[:, :2] + least(away, links.scale[:, 0])
+    return np.column_stack([places, theta])
+
+
 def _minimise(
     poses: np.ndarray, links: _Links, weights: np.ndarray, max_iterations: int, tolerance: float
 ) -> tuple[np.ndarray, float, int, bool]:
-    """Levenberg-Marquardt; returns poses, cost, steps and whether the last one was small."""
+    """Levenberg-Marquardt; returns poses, cost, steps and whether it came to an end."""
     links = links._replace(scale=links.scale * np.sqrt(weights)[:, None])
-    residuals = _residuals(poses, links)
-    cost = float(np.vdot(residuals, residuals))
-    damping, steps = 1e-6, 0
-    while steps < max_iterations and len(links.source):
+    if not len(links.source):
+        return poses, 0.0, 0, True
+    poses, residuals, cost = min(
+        (_weighed(start, links) for start in (poses, _turn_then_place(poses, links))),
+        key=lambda weighed: weighed[2],
+    )
+    damping, steps, converged = 1e-9, 0, False
+    while not converged and steps < max_iterations:
         jacobian = _jacobian(poses, links)
         normal, slope = jacobian.T @ jacobian, jacobian.T @ residuals.ravel()
-        while steps < max_iterations:
+        worse = True
+        while worse and not converged and steps < max_iterations:
             steps += 1
             step = _factor(normal, damping).solve(slope).reshape(-1, 3)
-            moved = poses - step
-            new_residuals = _residuals(moved, links)
-            new_cost = float(np.vdot(new_residuals, new_residuals))
-            if new_cost <= cost or np.abs(step).max() <= tolerance:
-                break
-            damping = max(10.0 * damping, 1e-4)
-        if new_cost <= cost:
-            poses, residuals, cost = moved, new_residuals, new_cost
-        damping = max(0.1 * damping, 1e-9)
-        if np.abs(step).max() <= tolerance:
-            return poses, cost, steps, True
-    return poses, cost, steps, len(links.source) == 0
+            moved = _weighed(poses - step, links)
+            gain = cost - moved[2]
+            worse = not gain >= 0.0
+            converged = bool(np.abs(step).max() <= tolerance) or 0.0 <= gain <= LEAST_GAIN * cost
+            damping = 10.0 * damping if worse else max(0.1 * damping, 1e-12)
+        if not worse:
+            poses, residuals, cost = moved
+    return poses, cost, steps, converged
+
+
+def _weighed(poses: np.ndarray, links: _Links) -> tuple[np.ndarray, np.ndarray, float]:
+    residuals = _residuals(poses, links)
+    return poses, residuals, float(np.vdot(residuals, residuals))
 
 
 def _admit(
@@ -247,31 +280,28 @@ def _admit(
     weights = np.where(doubtful, 0.0, confidence)
     gate = chdtri(2.0 + (links.scale[:, 2] > 0), FALSE_ALARM)
     candidates = np.flatnonzero(doubtful)
-    spread = _sampled_covariance(poses, links, weights, candidates, generator)
-    order = candidates[np.lexsort([np.trace(spread, axis1=1, axis2=2), -confidence[candidates]])]
-    steps, n_tried = 0, FIRST_TRIED
-    while True:
-        tried = order[:n_tried]
-        for _ in range(10):
-            believed = weights > 0
+    steps, n_tried = 0, 0
+    while n_tried < len(candidates):
+        n_tried = min(int(GROWTH * n_tried) + FIRST_TRIED, len(candidates))
+        for _ in range(ROUNDS):
+            spread = _sampled_covariance(poses, links, weights, candidates, generator)
+            looseness = np.trace(spread, axis1=1, axis2=2)
+            order = np.lexsort([looseness, -confidence[candidates]])[:n_tried]
+            tried = candidates[order]
+            residuals = _residuals(poses, links.pick(tried))[..., None]
+            surprise = residuals * np.linalg.solve(spread[order] + np.eye(3), residuals)
+            believed = surprise.sum(axis=(1, 2)) < gate[tried]
+            before = weights.copy()
+            weights[candidates] = 0.0
+            weights[tried[believed]] = confidence[tried[believed]]
+            if np.array_equal(weights, before):
+                break
+            chosen = weights > 0
             poses, _, used, _ = _minimise(
-                poses, links.pick(believed), weights[believed], max_iterations, 1e-3
+                poses, links.pick(chosen), weights[chosen], max_iterations, 1e-3
             )
             steps += used
-            residuals = _residuals(poses, links.pick(tried))
-            spread = _sampled_covariance(poses, links, weights, tried, generator)
-            surprise = np.einsum(
-                "li,li->l",
-                residuals,
-                np.linalg.solve(spread + np.eye(3), residuals[..., None])[..., 0],
-            )
-            judged = np.where(surprise < gate[tried], confidence[tried], 0.0)
-            if np.array_equal(judged, weights[tried]):
-                break
-            weights[tried] = judged
-        if n_tried >= len(order):
-            return poses, weights, steps
-        n_tried = int(GROWTH * n_tried) + 1
+    return poses, weights, steps
 
 
 def _sampled_covariance(

@@ -23,6 +23,7 @@ class Atlas:
         image: ``uint8 (h, w, 3)``.
         strip_origin: ``(n, LEVELS_U, LEVELS_V, 2)``: column and row of each strip's first pixel.
         strip_scale: ``(n, LEVELS_U, LEVELS_V, 2)``: pixels per metre along and up.
+        strip_per_m: ``(n,)``: pixels per metre at full size.
         ground: ``(LEVELS_GROUND, 4)``: column, row, columns and rows per full-size pixel.
         ceiling: Same, or ``None``.
         sky: Column, row, width and height of the sky, or ``None``.

@@ -75,7 +75,9 @@ class Canvas:
 
     def disc(self, x: float, z: float, radius: float, colour: Colour) -> None:
         """Fill a circle."""
-        cv2.circle(self.image, self.px(x, z), max(1, round(radius * self.per_m)), colour, -1)
+        cv2.circle(
+            self.image, self.px(x, z), max(1, round(radius * self.per_m)), colour, -1, cv2.LINE_AA
+        )
 
     def line(self, points: list[tuple[float, float]], width: float, colour: Colour) -> None:
         """Draw a polyline."""

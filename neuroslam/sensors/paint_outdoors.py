@@ -233,21 +233,27 @@ def lamps(rng: np.random.Generator, width_m: float, depth_m: float, per_m: float
     return c
 
 
-def sky(rng: np.random.Generator, hills: bool = True) -> np.ndarray:
+def sky(rng: np.random.Generator) -> np.ndarray:
     """Paint the sky all around, ``(256, 1536, 3)``, from the horizon to 45 degrees above it."""
     h, w = 256, 1536
     up = np.linspace(1.0, 0.0, h)[:, None, None]
     image = (1.0 - up) * np.array([206, 222, 236.0]) + up * np.array([88, 142, 214.0])
-    cloud = noise(rng, h, w // 2, (70.0, 170.0))
-    cloud = np.hstack([cloud, cloud[:, ::-1]])  # mirrored, so that the ends meet
-    cloud = np.clip(2.4 * cloud - 0.25, 0.0, 0.9)[..., None]
+    cloud = _around(rng, h, w, (70.0, 170.0))
+    cloud = np.clip(2.4 * cloud - 0.35, 0.0, 0.9)[..., None]
     image = image * (1.0 - cloud) + 250.0 * cloud
-    if hills:
-        for height, colour in ((30.0, (136, 158, 172)), (14.0, (92, 124, 98))):
-            ridge = noise(rng, 1, w // 2, (1.0, 60.0))[0]
-            ridge = height * (1.0 + 0.6 * np.concatenate([ridge, ridge[::-1]]))
-            image[np.arange(h)[::-1, None] < ridge[None]] = colour
+    for height, colour in ((30.0, (136, 158, 172)), (14.0, (92, 124, 98))):
+        ridge = height * (1.0 + 0.6 * _around(rng, 1, w, (1.0, 60.0))[0])
+        image[np.arange(h)[::-1, None] < ridge[None]] = colour
     return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def _around(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, float]) -> np.ndarray:
+    """Return smooth noise whose left and right ends meet."""
+    lap = w // 6
+    long = noise(rng, h, w + lap, grain_px)
+    meet = np.linspace(0.0, 1.0, lap, dtype=np.float32)
+    long[:, w:] = long[:, w:] * (1.0 - meet) + long[:, :lap] * meet
+    return long[:, lap:]
 
 
 def _cut(image: np.ndarray) -> np.ndarray:
@@ -317,5 +323,7 @@ def person(rng: np.random.Generator) -> list[np.ndarray]:
         cv2.rectangle(image, (86, 62), (106, 88), (*skin, 255), -1)
         cv2.ellipse(image, (96, 42), (24, 31), 0, 0, 360, (*skin, 255), -1, cv2.LINE_AA)
         cv2.ellipse(image, (96, 32), (27, 26), 0, 180, 360, (*hair, 255), -1, cv2.LINE_AA)
+        for eye in (87, 105):
+            cv2.circle(image, (eye, 43), 3, (30, 26, 24, 255), -1, cv2.LINE_AA)
         cycle.append(_cut(image))
     return cycle

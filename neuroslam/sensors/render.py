@@ -158,12 +158,12 @@ def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]
     if np.all(rays @ middle > 0.0):  # no ray points backward: what is all behind is out of sight
         ahead = np.maximum(start @ middle, (start + edge) @ middle)
         seen &= ahead > 0.0
-    index = np.flatnonzero(seen)
+    index = np.flatnonzero(seen) if seen.any() else np.zeros(1, dtype=int)
     start, edge, across = start[index], edge[index], across[index]
     x, y = rays[:, :1], rays[:, 1:]
     below = np.minimum(x * edge[:, 1] - y * edge[:, 0], -1e-12)
     share = start[:, 0] * y - start[:, 1] * x
-    meets = (share <= 1e-9) & (share >= below - 1e-9)
+    meets = (share <= 1e-9) & (share >= below - 1e-9) & (across < 0.0)
     depth = np.where(meets, across / below, _NEVER)
     strip = world.wall_strips[index]
     if len(world.pillars):

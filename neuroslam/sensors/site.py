@@ -56,8 +56,17 @@ class Site:
             cuts.append(cuts[-1] + self.rng.uniform(*lot_m))
         n = max(1, round((length - cuts[-1]) / lot_m[1]))
         cuts += [cuts[-1] + (length - cuts[-1]) * (i + 1) / n for i in range(n)]
-        at = [(a[0] + (b[0] - a[0]) * t / length, a[1] + (b[1] - a[1]) * t / length) for t in cuts]
+        east, north = (b[0] - a[0]) / length, (b[1] - a[1]) / length
+        at = [(a[0] + east * t, a[1] + north * t) for t in cuts]
+        first = len(self.strips)
         self.wall(at, painter)
+        for i in range(len(cuts) - 2):
+            left, right = (self.strips[first + i + k] for k in (0, 1))
+            here, behind = at[i + 1], (at[i + 1][0] - 6.0 * north, at[i + 1][1] + 6.0 * east)
+            if _height_m(left) > _height_m(right):  # the higher house shows its side
+                self.wall([here, behind], lambda rng, m, house=left: _side(rng, m, house))
+            elif _height_m(left) < _height_m(right):
+                self.wall([behind, here], lambda rng, m, house=right: _side(rng, m, house))
 
     def block(
         self,
@@ -110,3 +119,18 @@ class Site:
             people=tuple(people),
             **rest,
         )
+
+
+def _height_m(strip: tuple[np.ndarray, float]) -> float:
+    return strip[0].shape[0] / strip[1]
+
+
+def _side(
+    rng: np.random.Generator, length_m: float, front: tuple[np.ndarray, float]
+) -> tuple[np.ndarray, float]:
+    """Paint the windowless side of a house in the colour of its front."""
+    colour = tuple(np.median(front[0], axis=(0, 1)).astype(int).tolist())
+    c = paint.Canvas(length_m, _height_m(front), 12.0, colour)
+    paint.plaster(c.image, rng, colour, 0.1)
+    c.rect(0.0, c.height_m - 0.3, length_m, c.height_m, paint.darker(colour, 0.6))
+    return c.image, c.image.shape[0] / c.height_m

@@ -197,8 +197,8 @@ def read_track(path: Path, frame_rate_hz: float) -> Track:
     arrays = _load_arrays(path)
     if "pos" not in arrays or ("t" not in arrays and path.suffix == ".npz"):
         raise SourceError(
-            f"{path}: has the arrays {', '.join(arrays) or 'none'}; expected pos (n, 2) in metres "
-            "and t (n,) in seconds"
+            f"{path}: has the arrays {(', '.join(arrays) or 'none')[:100]}; expected pos (n, 2) in "
+            "metres and t (n,) in seconds"
         )
     shapes = {key: arrays[key].shape for key in ("pos", "t") if key in arrays}
     n = len(arrays["pos"]) if arrays["pos"].ndim else 0
@@ -252,10 +252,10 @@ def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray
 
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"pos": loaded}
-        with loaded:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return {"pos": loaded}
             return {key: loaded[key] for key in loaded.files}
     except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
         if "pickle" in str(error):

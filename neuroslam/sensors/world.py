@@ -192,6 +192,10 @@ class WorldSource(IndexedSource):
         """Return the true pose of frame ``n``."""
         return Pose(*self._truths[n].tolist())
 
+    def odometry(self) -> np.ndarray:
+        """Return the measured motion of all frames, ``(n_frames, 2)``: m/s, rad/s."""
+        return self._velocities.copy()
+
     def gain(self, time_s: float) -> float:
         """Return the brightness at this time: two slow waves, together within ``light``."""
         slow = math.sin(TWO_PI * time_s / 47.0 + self._phases[0])

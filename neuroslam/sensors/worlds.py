@@ -39,7 +39,7 @@ def _indoors(height: float, things: tuple[paint.Thing, ...], per_m: float = 64.0
 
 
 def _corridor(look: int) -> World:
-    """Office corridor around a block of rooms: doors, posters, windows, plants; 35 m a lap."""
+    """Office corridor around a block of rooms: doors, posters, windows, plants; 33 m a lap."""
     site, height = Site(look), 2.6
     painter = _indoors(height, paint.INDOORS)
     site.wall(_rectangle(6.4, 4.15, clockwise=True), painter)
@@ -48,7 +48,7 @@ def _corridor(look: int) -> World:
         (6.0, 3.75),
         (-6.0, -3.75),
         (-6.0, 3.75),
-        (1.4, -3.85),
+        (2.7, -3.85),
         (-4.9, 0.8),
         (-2.5, 2.65),
         (6.05, -1.2),
@@ -97,7 +97,7 @@ def _ellipse(look: int) -> World:
 
 
 def _figure_eight(look: int) -> World:
-    """Laboratory with two loops that share their middle aisle, no odometry; 46 m a lap."""
+    """Laboratory with two loops that share their middle aisle, no odometry; 44 m a lap."""
     site, height = Site(look + 2000), 2.4
     painter = _indoors(height, paint.INDOORS)
     site.wall(_rectangle(6.5, 4.0, clockwise=True), painter)
@@ -240,34 +240,16 @@ def _campus(look: int) -> World:
             site.rng.choice([12, 20, 38, 42, 45, 210]), site.rng.uniform(0.1, 0.5), 0.75
         )
         site.block(*box, (90.0, 90.0), hall(site.rng.choice([6.8, 9.4, 12.0]), stone))
+    park = [(9.0, -24.0), (47.0, -22.0), (68.0, -20.0), (90.0, -16.0)]
+    park += [(91.0, 22.0), (48.0, 20.0), (9.0, 18.0)]
+    court = [
+        (-51.0 + 32.0 * math.cos(t), 21.0 * math.sin(t)) for t in np.radians(range(40, 321, 20))
+    ]
     routes = [
         ellipse_route(32.0, 21.0, (-51.0, 0.0)),
-        rounded_route(
-            [
-                (9.0, -24.0),
-                (47.0, -22.0),
-                (68.0, -20.0),
-                (90.0, -16.0),
-                (91.0, 22.0),
-                (48.0, 20.0),
-                (9.0, 18.0),
-            ],
-            7.0,
-        ),
+        rounded_route(park, 7.0),
+        rounded_route([*court, *park], 7.0),
     ]
-    court = [
-        (-51.0 + 32.0 * math.cos(t), 21.0 * math.sin(t)) for t in np.radians(np.arange(40, 321, 20))
-    ]
-    grounds = [
-        (9.0, -24.0),
-        (47.0, -22.0),
-        (47.0, 20.0),
-        (90.0, 22.0),
-        (92.0, 27.0),
-        (50.0, 24.0),
-        (9.0, 18.0),
-    ]
-    routes.append(rounded_route([*court, *grounds], 6.0))
     for _ in range(400):
         if len(site.billboards) == 34:
             break
@@ -336,7 +318,8 @@ def build_world(name: str, look: int = 0) -> World:
 
     Args:
         name: Its name.
-        look: Seed of everything painted. The geometry of walls and routes does not depend on it.
+        look: Seed of everything painted, and of where houses, trees and pillars end and stand;
+            routes, and walls indoors, do not depend on it.
 
     Raises:
         SourceError: If there is no such world.

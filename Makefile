@@ -1,0 +1,37 @@
+# `make demo` and `make test` need python3 and make only: they set up .venv, install, and run.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test bench lint format notebooks clean
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+demo: $(VENV)/.installed
+	$(BIN)/neuroslam demo --out demo
+
+test: $(VENV)/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+bench: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.table
+
+lint: $(VENV)/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(VENV)/.installed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# Notebooks are kept as text: the .py is the source, the .ipynb is made from it.
+notebooks: $(VENV)/.installed
+	cd notebooks && ../$(BIN)/jupytext --to notebook --update *.py
+
+clean:
+	rm -rf $(VENV) demo out .pytest_cache .ruff_cache .hypothesis

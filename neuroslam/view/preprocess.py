@@ -1,0 +1,129 @@
+"""From a picture to a template: grey, crop, block mean, mean and patch normalisation."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from neuroslam.config import ViewConfig
+from neuroslam.errors import ConfigError
+
+
+class Encoded(NamedTuple):
+    """A picture as a template.
+
+    Attributes:
+        template: Grey in [0, 1], ``float64``, shape ``(template_height, template_width)``.
+        contrast: Standard deviation of the grey view before it was normalised.
+    """
+
+    template: np.ndarray
+    contrast: float
+
+
+def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
+    """Make the template of a picture.
+
+    Args:
+        image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+        config: Crop, size and normalisations.
+
+    Raises:
+        ConfigError: If the crop leaves the picture, or is smaller than the template.
+
+    Example:
+        >>> picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
+        >>> config = ViewConfig(
+        ...     template_width=4, template_height=3, shift_match=1, normalisation=0
+        ... )
+        >>> (encode(picture, config).template[0] * 255).tolist()
+        [4.5, 6.5, 8.5, 10.5]
+    """
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
+    contrast = float(view.std()) if config.min_contrast else 1.0
+    if config.normalisation:
+        view = normalise_mean(view, config.normalisation)
+    if config.patch_radius:
+        view = normalise_patches(view, config.patch_radius, config.patch_min_std)
+    return Encoded(view, contrast)
+
+
+def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:
+    """Cut ``x_min, x_max, y_min, y_max`` out of a grey picture; ``None`` takes all of it.
+
+    Raises:
+        ConfigError: If the region leaves the picture.
+    """
+    if region is None:
+        return image
+    x_min, x_max, y_min, y_max = region
+    height, width = image.shape
+    if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
+        raise ConfigError(
+            f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the picture "
+            f"of {width}x{height} px; change it, or leave it out to take the whole picture"
+        )
+    return image[y_min:y_max, x_min:x_max]
+
+
+def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Shrink to ``(height, width)`` by the mean of whole blocks; a remainder is left out.
+
+    Sums are of integers, so they are exact; each is divided once.
+
+    Raises:
+        ConfigError: If the picture is smaller than that.
+    """
+    h, w = image.shape
+    block_h, block_w = h // height, w // width
+    if not block_h or not block_w:
+        raise ConfigError(
+            f"view.template_width x template_height = {width}x{height} is larger than the "
+            f"cropped picture of {w}x{h} px; make the template smaller or the crop larger"
+        )
+    blocks = image[: height * block_h, : width * block_w].reshape(height, block_h, -1)
+    rows = np.add.reduce(blocks, axis=1, dtype=np.uint32)
+    sums = rows[:, ::block_w].copy()  # adding columns is quicker than reducing a short axis
+    for column in range(1, block_w):
+        sums += rows[:, column::block_w]
+    return sums / (255.0 * block_h * block_w)
+
+
+def normalise_mean(view: np.ndarray, mean: float) -> np.ndarray:
+    """Scale grey to a mean, and clip to [0, 1]; a black view stays black.
+
+    Example:
+        >>> normalise_mean(np.array([[0.1, 0.3]]), 0.5).tolist()
+        [[0.25, 0.75]]
+    """
+    now = view.mean()
+    return np.clip(view * mean / now, 0.0, 1.0) if now > 0.0 else view
+
+
+def normalise_patches(view: np.ndarray, radius: int, min_std: float) -> np.ndarray:
+    r"""Express each pixel in standard deviations of the patch around it.
+
+    .. math:: z = (x - \mu) / \sigma, \qquad v = \operatorname{clip}((z + 3) / 6,\, 0,\, 1)
+
+    with the mean and deviation of the pixels within ``radius`` that lie in the view.
+
+    Args:
+        view: Grey in [0, 1].
+        radius: Half width of a patch, px.
+        min_std: Flatter patches become 0.5.
+    """
+    size = (2 * radius + 1, 2 * radius + 1)
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+    count = total(np.ones_like(view))
+    middle = view.mean()  # deviations are of small differences: take them near zero
+    mean = total(view - middle) / count
+    variance = total((view - middle) ** 2) / count - mean**2
+    std = np.sqrt(np.maximum(variance, 0.0))
+    flat = std <= max(min_std, 1e-6)
+    z = (view - middle - mean) / np.where(flat, 1.0, std)
+    return np.where(flat, 0.5, np.clip((z + 3.0) / 6.0, 0.0, 1.0))

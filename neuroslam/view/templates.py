@@ -1,0 +1,193 @@
+"""Local view cells: which stored view does a picture show, and is it a new one?"""
+
+import numpy as np
+import torch
+from torch import nn
+
+from neuroslam.config import ViewConfig
+from neuroslam.geometry import TWO_PI
+from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.types import NO_TEMPLATE, ViewMatch
+from neuroslam.view.preprocess import encode
+from neuroslam.view.search import (
+    Geometry,
+    Nearest,
+    distances,
+    find_nearest,
+    template_blocks,
+)
+
+GATE_MARGIN = 0.005
+"""Added to the threshold where templates are skipped for their mean, as OpenRatSLAM does."""
+
+
+class LocalViewCells(nn.Module):
+    r"""Stores views as templates and recognises them.
+
+    The distance of a view :math:`q` to a template :math:`t` is the smallest mean absolute
+    difference over the shifts :math:`s`,
+
+    .. math:: d(q, t) = \min_s \frac{1}{|\Omega|} \sum_{(i,j) \in \Omega} |q_{i,j} - t_{i,j+s}|
+
+    A forward view is shifted by up to ``shift_match`` columns, and :math:`\Omega` is its middle,
+    without that many columns at either side; a panorama rolls through the full turn. The nearest
+    template within ``threshold`` is recognised; if there is none, the view becomes a template.
+
+    Args:
+        config: Preprocessing, shifts, threshold, precision.
+
+    Example:
+        >>> cells = LocalViewCells(ViewConfig(template_width=16, template_height=8, shift_match=2))
+        >>> picture = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
+        >>> cells(picture).is_new, cells(picture).template
+        (True, 0)
+    """
+
+    def __init__(self, config: ViewConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.geometry = Geometry.of(config)
+        n_pixels = config.template_width * config.template_height
+        columns = {
+            "pixels": ((n_pixels,), torch.uint8),  # column after column
+            "blocks": ((self.geometry.n_blocks,), torch.uint8),
+        }
+        self._exact = config.precision == "float64"
+        if self._exact:
+            columns["values"] = ((n_pixels,), torch.float64)
+        if config.mean_gate:
+            columns["mean"] = ((), torch.float64)
+        self.templates = GrowingTable(columns)
+        self.last = Scalars(template=NO_TEMPLATE)
+
+    @property
+    def n(self) -> int:
+        """Number of templates."""
+        return self.templates.n
+
+    def encode(self, image: np.ndarray) -> np.ndarray:
+        """Make the template of a picture: grey in [0, 1], ``(template_height, template_width)``.
+
+        Raises:
+            ConfigError: If crop and template do not fit the picture.
+        """
+        return encode(image, self.config).template
+
+    def template_image(self, template: int) -> np.ndarray:
+        """Return a template as a grey picture, ``uint8``, ``(template_height, template_width)``."""
+        pixels = self.templates["pixels"][template].numpy(force=True)
+        return pixels.reshape(self.config.template_width, self.config.template_height).T.copy()
+
+    def search(self, view: np.ndarray, limit: float = np.inf) -> ViewMatch:
+        """Find the nearest template, without learning; the lowest id of equally near ones.
+
+        Args:
+            view: As :meth:`encode` makes it, ``(template_height, template_width)``.
+            limit: Mean difference beyond which the search may stop: a farther template is then
+                near the nearest, not surely the nearest.
+
+        Returns:
+            The template and its distance; ``NO_TEMPLATE`` and -1 if there is none to compare with.
+        """
+        query = to_bytes(view.T)
+        if self._exact or self.config.mean_gate:
+            found, error = self._search_values(np.ascontiguousarray(view.T), query)
+        else:
+            scale = 255.0 * self.geometry.n_pixels
+            found = find_nearest(
+                self.templates["pixels"].numpy(force=True),
+                self.templates["blocks"].numpy(force=True),
+                query,
+                self.geometry,
+                limit * scale,
+                (self.last.template, self.last.template + 1),
+            )
+            error = found.distance / scale
+        if found.id == NO_TEMPLATE:
+            return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+        return ViewMatch(found.id, error, self._relative_heading(found.shift), False)
+
+    def forward(self, image: np.ndarray) -> ViewMatch:
+        """Recognise a picture, or store it as a new template.
+
+        Args:
+            image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+
+        Returns:
+            The match; ``NO_TEMPLATE`` if the picture has too little contrast to show anything.
+
+        Raises:
+            ConfigError: If crop and template do not fit the picture.
+        """
+        view, contrast = encode(image, self.config)
+        if contrast < self.config.min_contrast:
+            return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+        match = self.search(view, self.config.threshold)
+        if match.template == NO_TEMPLATE or match.error > self.config.threshold:
+            match = ViewMatch(self._store(view), match.error, 0.0, True)
+        self.last.template = match.template
+        return match
+
+    def _store(self, view: np.ndarray) -> int:
+        columns = np.ascontiguousarray(view.T)
+        pixels = to_bytes(columns)
+        row = {
+            "pixels": torch.from_numpy(pixels.reshape(-1)),
+            "blocks": torch.from_numpy(template_blocks(pixels, self.geometry)),
+        }
+        if self._exact:
+            row["values"] = torch.from_numpy(columns.reshape(-1))
+        if self.config.mean_gate:
+            row["mean"] = view.mean() if self._exact else pixels.mean() / 255.0
+        return self.templates.append(**row)
+
+    def _search_values(self, view: np.ndarray, query: np.ndarray) -> tuple[Nearest, float]:
+        """Search in full precision: bytes tell which templates and shifts can be the nearest.
+
+        Rounding to bytes changes a pixel by at most half a level, in view and template, so a sum
+        over N pixels by at most N levels: what is nearest is within 2 N of the nearest in bytes.
+        """
+        nothing = Nearest(NO_TEMPLATE, 0, 0), -1.0
+        ids = np.arange(self.n)
+        if self.config.mean_gate:
+            means = self.templates["mean"].numpy(force=True)
+            here = view.mean() if self._exact else query.mean() / 255.0
+            ids = np.flatnonzero(np.abs(means - here) <= self.config.threshold + GATE_MARGIN)
+        if not len(ids):
+            return nothing
+        g = self.geometry
+        pixels = self.templates["pixels"].numpy(force=True)
+        apart = distances(pixels if len(ids) == self.n else pixels[ids], query, g)
+        slack = 2 * g.n_pixels if self._exact else 0
+        shifts, rows = np.nonzero(apart <= apart.min() + slack)
+        if not self._exact:
+            first = np.lexsort((shifts, rows))[0]
+            error = apart[shifts[first], rows[first]] / (255.0 * g.n_pixels)
+            return Nearest(int(ids[rows[first]]), 0, g.offsets[shifts[first]]), float(error)
+        values = self.templates["values"].numpy(force=True).reshape(self.n, g.width, g.height)
+        errors = np.empty(len(rows))
+        for shift in np.unique(shifts):
+            at = shifts == shift
+            offset = g.offsets[shift]
+            over, part = values[ids[rows[at]]], view
+            if g.panoramic:
+                part = np.roll(view, offset, axis=0)
+            else:
+                over = over[:, offset : offset + g.overlap]
+                part = view[g.margin : g.margin + g.overlap]
+            errors[at] = np.abs(over - part).reshape(len(over), -1).mean(axis=1)
+        best = np.lexsort((shifts, rows, errors))[0]
+        return Nearest(int(ids[rows[best]]), 0, g.offsets[shifts[best]]), float(errors[best])
+
+    def _relative_heading(self, offset: int) -> float:
+        """Heading now minus heading when learnt: rolling right undoes a turn to the right."""
+        if not self.config.panoramic:
+            return 0.0
+        width = self.config.template_width
+        turned = (width - offset) % width
+        return TWO_PI * (turned if 2 * turned <= width else turned - width) / width
+
+
+def to_bytes(view: np.ndarray) -> np.ndarray:
+    """Round grey in [0, 1] to ``uint8``, contiguous."""
+    return np.ascontiguousarray(np.rint(view * 255.0).astype(np.uint8))

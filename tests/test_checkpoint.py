@@ -1,0 +1,157 @@
+"""Brain files: complete, checked, written whole or not at all."""
+
+import json
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
+from neuroslam.config import BrainConfig
+from neuroslam.errors import CheckpointError
+from neuroslam.sensors import open_source
+
+WORLD = "world:corridor?laps=2&noise=0.05"
+CONFIG = BrainConfig(max_gap_s=5.0, map={"rest_tolerance": 0.0})
+
+
+def lived(frames: int) -> NavigationBrain:
+    brain = NavigationBrain(CONFIG)
+    for frame in open_source(WORLD).frames(0, frames):
+        brain(frame)
+    return brain
+
+
+@pytest.fixture(scope="module")
+def brain():
+    return lived(60)
+
+
+@pytest.fixture
+def saved(brain, tmp_path):
+    path = tmp_path / "brain.safetensors"
+    save_brain(brain, path)
+    return path
+
+
+def test_what_is_saved_is_what_is_loaded(brain, saved):
+    copy = load_brain(saved)
+    assert copy.config == brain.config
+    state = copy.state_dict()
+    for name, tensor in brain.state_dict().items():
+        assert torch.equal(state[name], tensor), name
+        assert state[name].dtype == tensor.dtype, name
+
+
+def test_two_saves_of_one_brain_are_equal_files(brain, saved, tmp_path):
+    save_brain(brain, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
+
+
+@pytest.mark.parametrize("stop", [1, 17, 120, 345])
+def test_going_on_in_a_new_process_is_bit_equal_to_never_having_stopped(stop, tmp_path):
+    """Before a first loop, in the middle, and after loop closures (a lap has 340 frames)."""
+    end = stop + 15
+    save_brain(lived(stop), tmp_path / "cut.safetensors")
+    save_brain(lived(end), tmp_path / "whole.safetensors")
+    program = (
+        "import sys, torch; torch.set_num_threads(1);"
+        "from neuroslam.brain import load_brain, save_brain;"
+        "from neuroslam.sensors import open_source;"
+        "brain = load_brain(sys.argv[1]);"
+        f"[brain(f) for f in open_source({WORLD!r}).frames({stop}, {end})];"
+        "save_brain(brain, sys.argv[2])"
+    )
+    command = [sys.executable, "-c", program, tmp_path / "cut.safetensors", tmp_path / "on"]
+    subprocess.run(command, check=True)
+    assert (tmp_path / "on").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r"nowhere\.safetensors: no such brain file"):
+        load_brain(tmp_path / "nowhere.safetensors")
+
+
+@pytest.mark.parametrize("keep", [0, 5, 100, 0.5, 0.999])
+def test_a_truncated_file_is_refused(saved, keep):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+    with pytest.raises(CheckpointError, match=r"brain\.safetensors: (truncated|damaged)"):
+        load_brain(saved)
+
+
+def test_any_flipped_bit_is_noticed(saved):
+    content = bytearray(saved.read_bytes())
+    places = np.random.default_rng(0).integers(8, len(content), 40)
+    for at in places:
+        flipped = bytearray(content)
+        flipped[at] ^= 0x10
+        saved.write_bytes(flipped)
+        with pytest.raises(CheckpointError, match=r"brain\.safetensors"):
+            load_brain(saved)
+
+
+def test_a_newer_format_asks_for_an_upgrade(brain, tmp_path):
+    path = tmp_path / "newer.safetensors"
+    about = {"format": 99, "config": {}, "sha256": "0"}
+    save_file({"a": torch.zeros(1)}, path, metadata={"neuroslam": json.dumps(about)})
+    with pytest.raises(CheckpointError, match="format 99, this neuroslam reads up to 1; upgrade"):
+        load_brain(path)
+
+
+def test_another_safetensors_file_is_not_a_brain(tmp_path):
+    save_file({"a": torch.zeros(1)}, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="not one that neuroslam wrote"):
+        load_brain(tmp_path / "other")
+
+
+def test_a_pickle_is_refused_and_never_run(brain, tmp_path):
+    for name, content in (("torch", None), ("plain", pickle.dumps({"a": 1}))):
+        path = tmp_path / name
+        if content is None:
+            torch.save(brain.state_dict(), path)
+        else:
+            path.write_bytes(content)
+        with pytest.raises(CheckpointError, match="a pickle"):
+            load_brain(path)
+
+
+def test_a_state_that_does_not_fit_its_config_is_refused(brain, tmp_path):
+    path = tmp_path / "odd.safetensors"
+    save_brain(brain, path)
+    config, tensors = read_checkpoint(path)
+    tensors.pop("map.state.dx_m")
+    from neuroslam.brain.checkpoint import tensors_digest
+
+    about = {
+        "format": 1,
+        "config": config.model_dump(mode="json"),
+        "sha256": tensors_digest(tensors),
+    }
+    save_file(tensors, path, metadata={"neuroslam": json.dumps(about)})
+    with pytest.raises(CheckpointError, match="does not fit its config"):
+        load_brain(path)
+
+
+def test_a_failed_save_leaves_the_old_brain(brain, saved, monkeypatch):
+    before = saved.read_bytes()
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("neuroslam.brain.checkpoint.save_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_brain(brain, saved)
+    assert saved.read_bytes() == before
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_the_file_holds_tensors_and_text_only(saved):
+    with safe_open(saved, framework="pt") as file:
+        assert list(file.metadata()) == ["neuroslam"]
+        assert json.loads(file.metadata()["neuroslam"])["format"] == 1
