@@ -350,3 +350,35 @@ def test_the_same_on_an_accelerator():
         here.integrate(Motion(v, 0.1 * v, 0.1))
         there.integrate(Motion(v.cuda(), 0.1 * v.cuda(), 0.1))
     torch.testing.assert_close(there.activity.cpu(), here.activity)
+
+
+def test_a_robot_that_stands_still_for_an_hour_stays_where_it_is():
+    cells = PoseCellNetwork(PoseCellConfig(inject_after=0))
+    for template in range(2):
+        cells(Motion(0.2, 0.0, 1.0), ViewMatch(template, -1.0, 0.0, True))
+    before = cells.estimate
+    for _ in range(3000):
+        cells(STILL, known_view(cells, 1))
+    assert ring_distance(cells.estimate.x, before.x, 21) < 1.5
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+def test_state_goes_through_a_state_dict_and_a_change_of_type(batch):
+    cells = PoseCellNetwork(PoseCellConfig(), batch=batch)
+    for _ in range(5):
+        cells.integrate(
+            Motion(torch.full((2,), 0.3) if batch else 0.3, torch.zeros(2) if batch else 0.1, 1.0)
+        )
+    copy = PoseCellNetwork(PoseCellConfig(), batch=batch)
+    copy.load_state_dict(cells.state_dict())
+    assert torch.equal(copy.activity, cells.activity)
+    double = PoseCellNetwork(PoseCellConfig(), batch=batch)
+    double.load_state_dict(cells.state_dict())
+    double = double.to(torch.float64)
+    assert double.activity.dtype == torch.float64
+    torch.testing.assert_close(double.activity.float(), cells.activity)
+    for each in (cells, copy):
+        each.integrate(
+            Motion(torch.full((2,), 0.3) if batch else 0.3, torch.zeros(2) if batch else 0.1, 1.0)
+        )
+    assert torch.equal(copy.activity, cells.activity)

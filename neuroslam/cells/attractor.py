@@ -4,6 +4,7 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -209,11 +210,11 @@ def inject(packet: Packet, at: PoseEstimate, energy: float) -> Packet:
     packet = widen(packet, tuple(c % n for c, n in zip(corner, packet.shape, strict=True)))
     added = packet.values.new_tensor(energy)
     for axis, (c, low) in enumerate(zip(where, corner, strict=True)):
-        weights = packet.values.new_zeros(packet.values.shape[axis])
+        weights = [0.0] * packet.values.shape[axis]
         ahead = (low - packet.origin[axis]) % packet.shape[axis]
         weights[ahead] = 1.0 - (c - low)
         weights[(ahead + 1) % packet.shape[axis]] = c - low
-        added = added[..., None] * weights
+        added = added[..., None] * packet.values.new_tensor(weights)
     return packet._replace(values=packet.values + added)
 
 
@@ -232,7 +233,7 @@ def decode(packet: Packet, radius: int) -> PoseEstimate:
     Returns:
         Position in cells, each in ``[0, n)``.
     """
-    values = packet.values.detach()
+    values = packet.values.numpy(force=True)
     a, b, c = values.shape
     peak = int(values.argmax())
     peaks = (peak // (b * c), peak // c % b, peak % c)
@@ -241,7 +242,7 @@ def decode(packet: Packet, radius: int) -> PoseEstimate:
         rolls = [
             size // 2 - p if w else 0 for size, p, w in zip((a, b, c), peaks, whole, strict=True)
         ]
-        values = torch.roll(values, rolls, dims=(0, 1, 2))
+        values = np.roll(values, rolls, axis=(0, 1, 2))
         peaks = tuple(p + r for p, r in zip(peaks, rolls, strict=True))
     else:
         rolls = (0, 0, 0)

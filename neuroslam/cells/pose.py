@@ -1,6 +1,7 @@
 """Pose cells: a belief over x, y and heading that follows odometry and is corrected by views."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,21 @@ from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
+
+_TIRED = math.log(30.0) / 1.2
+"""Decay at which a view injects nothing any more."""
+
+
+@dataclass
+class _Now:
+    packet: Packet
+    slip: list[float] | Tensor  # cells by which the estimate is behind odometry: x, y, theta
+    estimate: PoseEstimate | Tensor | None = None  # of the packet, when it was asked for
+    injected: bool = False  # since the last step
+
+
+def _no_slip(like: Tensor) -> list[float] | Tensor:
+    return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
 
 
 class PoseCellNetwork(nn.Module):
@@ -61,10 +77,11 @@ class PoseCellNetwork(nn.Module):
         slip = torch.zeros(3 if batch is None else (batch, 3), dtype=torch.float64)
         self.register_buffer("slip", slip)
         self._couplings: dict[tuple[int, int, int], Couplings] = {}
-        self._packet: Packet | None = None
-        self._estimate: PoseEstimate | Tensor | None = None
-        self._injected = False
+        # In use the state is here, not in the buffers: those would cost more than the cells do.
+        self._now = _Now(Packet(self.window, (0, 0, 0), self.shape), slip)
+        self.register_state_dict_pre_hook(lambda module, *_: module._write_buffers())
         self.register_load_state_dict_pre_hook(_take_window_size)
+        self.register_load_state_dict_post_hook(lambda module, _: module._read_buffers())
         self.reset()
 
     def reset(self) -> None:
@@ -86,17 +103,12 @@ class PoseCellNetwork(nn.Module):
     @property
     def packet(self) -> Packet:
         """The active window and where it lies on the torus."""
-        if self._packet is None:
-            self._packet = Packet(self.window, tuple(self.origin.tolist()), self.shape)
-        return self._packet
+        return self._now.packet
 
     @packet.setter
     def packet(self, packet: Packet) -> None:
-        # Not self.window = ...: nn.Module takes several microseconds over each.
-        self._buffers["window"] = packet.values
-        self._buffers["origin"] = torch.tensor(packet.origin)
-        self.__dict__["_packet"] = packet
-        self.__dict__["_estimate"] = None
+        self._now.packet = packet
+        self._now.estimate = None
 
     @property
     def activity(self) -> Tensor:
@@ -111,23 +123,20 @@ class PoseCellNetwork(nn.Module):
                 f"PoseCellNetwork: activity has shape {tuple(activity.shape)}, expected {expected}"
             )
         self.packet = to_packet(activity.to(self.window))
-        self.slip = torch.zeros_like(self.slip)
+        self._now.slip = _no_slip(self.slip)
 
     @property
     def estimate(self) -> PoseEstimate | Tensor:
         """Centre of the dominant packet in cells; in a batch x, y, theta, shape ``(batch, 3)``."""
-        if self._estimate is None:
-            radius = self.config.decode_radius
-            if self.batch is None:
-                self._estimate = decode(self.packet, radius)
-            else:
-                self._estimate = decode_batch(self.packet, radius)
-        return self._estimate
+        if self._now.estimate is None:
+            find = decode if self.batch is None else decode_batch
+            self._now.estimate = find(self._now.packet, self.config.decode_radius)
+        return self._now.estimate
 
     @property
     def peak(self) -> float:
         """Activity of the most active cell: near 0 when the belief is spread."""
-        return self.window.max().item()
+        return self.packet.values.max().item()
 
     def integrate(self, motion: Motion) -> PoseEstimate | Tensor:
         """Settle the attractor, move its activity by ``motion`` and return the estimate.
@@ -138,9 +147,8 @@ class PoseCellNetwork(nn.Module):
         Raises:
             MapError: If inhibition silenced every cell.
         """
-        c = self.config
-        packet = self.packet
-        sizes = tuple(packet.values.shape[-3:])
+        c, now = self.config, self._now
+        sizes = tuple(now.packet.values.shape[-3:])
         coupled = self._couplings.get(sizes)
         if coupled is None:
             with torch.inference_mode(mode=False):  # kept for steps that may want gradients
@@ -150,17 +158,20 @@ class PoseCellNetwork(nn.Module):
                 )
             self._couplings[sizes] = coupled
         reach = (c.excite_size // 2 + c.inhibit_size // 2,) * 3
-        settled = settle(packet, coupled, reach, c.global_inhibition)
-        before = self.estimate
-        slip = self.slip if c.exact_gain else torch.zeros_like(self.slip)
         distance = motion.v_m_s * motion.dt_s / c.cell_size_m
         turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
+        follows = c.exact_gain and not now.injected
+        if not follows:
+            now.slip = _no_slip(self.slip)
+            now.injected = False
+        before = self.estimate if follows else None
+        settled = settle(now.packet, coupled, reach, c.global_inhibition)
         if self.batch is None:
-            aside_x, aside_y, aside_turn = slip.tolist()
-            self.packet = path_integrate(settled, distance, turn + aside_turn, (aside_x, aside_y))
+            x, y, theta = now.slip
+            self.packet = path_integrate(settled, distance, turn + theta, (x, y))
         else:
-            self.packet = path_integrate(settled, distance, turn + slip[:, 2], slip[:, :2])
-        if c.exact_gain:
+            self.packet = path_integrate(settled, distance, turn + now.slip[:, 2], now.slip[:, :2])
+        if follows:
             self._measure_slip(before, distance, turn)
         return self.estimate
 
@@ -174,22 +185,19 @@ class PoseCellNetwork(nn.Module):
         :math:`s \leftarrow s + \Delta_\text{odometry} - \Delta_\text{estimate}` is fed back,
         and forgotten where the belief jumped (another packet won) or a view has just injected.
         """
-        now = self.estimate
+        after, slip = self.estimate, self._now.slip
         sizes = (self.shape[2], self.shape[1], self.shape[0])
         if self.batch is None:
             heading = TWO_PI * before.theta / self.shape[0]
             asked = (distance * math.cos(heading), distance * math.sin(heading), turn)
             errors = [
                 (was + step - is_ + n / 2) % n - n / 2
-                for was, step, is_, n in zip(before, asked, now, sizes, strict=True)
+                for was, step, is_, n in zip(before, asked, after, sizes, strict=True)
             ]
-            jumped = self._injected or any(abs(e) > 1.0 for e in errors)
-            slip = (
-                [0.0] * 3
-                if jumped
-                else [s + e for s, e in zip(self.slip.tolist(), errors, strict=True)]
+            jumped = max(map(abs, errors)) > 1.0
+            self._now.slip = (
+                [0.0, 0.0, 0.0] if jumped else [s + e for s, e in zip(slip, errors, strict=True)]
             )
-            self.slip = torch.tensor(slip, dtype=torch.float64)
         else:
             heading = TWO_PI * before[:, 2] / self.shape[0]
             asked = torch.stack(
@@ -197,10 +205,9 @@ class PoseCellNetwork(nn.Module):
                 dim=1,
             )
             n = torch.tensor(sizes, dtype=before.dtype, device=before.device)
-            errors = (before + asked - now + n / 2) % n - n / 2
-            slip = self.slip + errors.to(self.slip)
-            self.slip = slip.where((errors.abs() <= 1.0).all(1, keepdim=True), 0.0)
-        self._injected = False
+            errors = (before + asked - after + n / 2) % n - n / 2
+            kept = (errors.abs() <= 1.0).all(1, keepdim=True)
+            self._now.slip = (slip + errors.to(slip)).where(kept, 0.0)
 
     def see(self, view: ViewMatch) -> None:
         r"""Bind a new view to the present estimate; let a known one inject where it was bound.
@@ -240,9 +247,10 @@ class PoseCellNetwork(nn.Module):
             return
         if view.template == self.last.view:
             b["decay"][view.template] += c.active_decay
-        energy = c.inject_energy / 30.0 * (30.0 - math.exp(1.2 * b["decay"][view.template].item()))
-        if energy <= 0.0:
+        decay = b["decay"][view.template].item()
+        if decay >= _TIRED:
             return
+        energy = c.inject_energy / 30.0 * (30.0 - math.exp(1.2 * decay))
         turned = view.relative_heading_rad * c.n_theta / TWO_PI
         at = PoseEstimate(
             b["x"][view.template].item(),
@@ -252,17 +260,28 @@ class PoseCellNetwork(nn.Module):
         if c.inject_at_cell:
             at = PoseEstimate(*(math.floor(value) for value in at))
         self.packet = inject(self.packet, at, energy)
-        self._injected = True
+        self._now.injected = True
 
     def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:
         """Advance one frame: the view injects, the attractor settles, odometry moves it."""
         self.see(view)
         return self.integrate(motion)
 
+    def _write_buffers(self) -> None:
+        packet, slip = self._now.packet, self._now.slip
+        self.window, self.origin = packet.values, torch.tensor(packet.origin)
+        self.slip = slip if self.batch is not None else torch.tensor(slip, dtype=torch.float64)
+
+    def _read_buffers(self) -> None:
+        packet = Packet(self.window, tuple(self.origin.tolist()), self.shape)
+        self._now = _Now(packet, self.slip if self.batch is not None else self.slip.tolist())
+
     def _apply(self, fn: object, recurse: bool = True) -> "PoseCellNetwork":
         self._couplings.clear()
-        self._packet = self._estimate = None
-        return super()._apply(fn, recurse)
+        self._write_buffers()
+        super()._apply(fn, recurse)
+        self._read_buffers()
+        return self
 
 
 def _take_window_size(
@@ -271,4 +290,3 @@ def _take_window_size(
     saved = state.get(prefix + "window")
     if saved is not None:
         module.window = module.window.new_empty(saved.shape)
-        module._packet = module._estimate = None

@@ -331,7 +331,9 @@ class ExperienceMap(nn.Module):
             if self._relaxation is None:
                 links = self.links
                 self._relaxation = Relaxation(*links[:5], n=self.n)
-            solved, s.largest_correction = self._relaxation.run(poses.numpy(), loops, c.correction)
+            solved, s.largest_correction = self._relaxation.run(
+                poses.numpy(), loops, c.correction, c.rest_tolerance
+            )
             s.at_rest = int(s.largest_correction <= c.rest_tolerance)
         heading_before = poses[s.current, 2].item()
         poses.copy_(torch.from_numpy(solved))

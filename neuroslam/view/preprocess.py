@@ -95,7 +95,7 @@ def normalise_mean(view: np.ndarray, mean: float) -> np.ndarray:
     """Scale grey to a mean, and clip to [0, 1]; a black view stays black.
 
     Example:
-        >>> normalise_mean(np.array([[0.1, 0.3]]), 0.5).tolist()
+        >>> normalise_mean(np.array([[0.1, 0.3]]), 0.5).round(6).tolist()
         [[0.25, 0.75]]
     """
     now = view.mean()
