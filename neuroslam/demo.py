@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from neuroslam.brain import load_brain
+from neuroslam.config import BrainConfig
 from neuroslam.plotting import plot_summary, save
 from neuroslam.run_files import odometry_track, read_frames, read_trace, trajectory
-from neuroslam.runs import read_plan, resolve_config, resume, run
+from neuroslam.runs import read_plan, resume, run
 from neuroslam.sensors import open_source
 from neuroslam.types import StepResult
 
-WORLD = "world:corridor?laps=2"
+WORLD = "world:corridor?laps=2&noise=0.05"
 
 
 def demo(
@@ -32,7 +33,7 @@ def demo(
     first = run(
         WORLD,
         out,
-        resolve_config("corridor"),
+        BrainConfig(),
         stop=n_frames // 2,
         overwrite=True,
         on_step=on_step,

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -41,8 +42,7 @@ class RowWriter:
         """Start the files of a new run, in place of an earlier one's."""
         try:
             out.mkdir(parents=True, exist_ok=True)
-            for old in (out / "events").glob("events.out.*"):
-                old.unlink()
+            shutil.rmtree(out / "events", ignore_errors=True)
             (out / "brain.safetensors").unlink(missing_ok=True)  # it would not fit the new rows
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
                 frames.write(FRAME_COLUMNS + "\n")
@@ -78,11 +78,17 @@ class RowWriter:
 
     def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
         """Append the rows of one frame."""
-        c = r.cells
+        motion, match, pose, cells = (
+            ",".join([repr(float(value)) for value in values])  # float: sources may hand numpy's
+            for values in (
+                (r.time_s, *r.motion[:2]),
+                (r.view.error, r.view.relative_heading_rad),
+                r.pose,
+                r.cells,
+            )
+        )
         self.frames.write(
-            f"{r.frame},{r.time_s!r},{r.motion.v_m_s!r},{r.motion.w_rad_s!r},{r.view.template},"
-            f"{r.view.error!r},{r.view.relative_heading_rad!r},{r.action},{r.experience},"
-            f"{r.pose.x_m!r},{r.pose.y_m!r},{r.pose.theta_rad!r},{c.x!r},{c.y!r},{c.theta!r},"
+            f"{r.frame},{motion},{r.view.template},{match},{r.action},{r.experience},{pose},{cells},"
             f"{r.n_templates},{r.n_experiences},{r.n_links}\n"
         )
         truth = frame.truth or (math.nan, math.nan, math.nan)

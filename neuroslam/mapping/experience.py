@@ -335,9 +335,8 @@ class ExperienceMap(nn.Module):
                 poses.numpy(), loops, c.correction, c.rest_tolerance
             )
             s.at_rest = int(s.largest_correction <= c.rest_tolerance)
-        heading_before = poses[s.current, 2].item()
+        turned = solved[s.current, 2].item() - poses[s.current, 2].item()
         poses.copy_(torch.from_numpy(solved))
-        turned = solved[s.current, 2] - heading_before
         self._turn_offset(wrap_angle(turned))
         return s.largest_correction
 
