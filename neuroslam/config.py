@@ -19,7 +19,7 @@ class _Section(BaseModel):
 
 
 class OdometryConfig(_Section):
-    """Visual odometry: two image regions, matched with their predecessors (specs: RatSLAM 1)."""
+    """Visual odometry: two image regions, matched with their predecessors."""
 
     use: Literal["auto", "visual", "given"] = Field(
         "auto", description="auto: the source's own odometry where it has one, else visual"
@@ -36,7 +36,7 @@ class OdometryConfig(_Section):
         100.0, gt=0, description="speed per unit of profile difference; larger: longer map"
     )
     max_speed_m_s: float = Field(5.0, gt=0, description="speeds are cut here")
-    min_speed_m_s: float = Field(0.0, ge=0, description="below it the robot stands still")
+    min_speed_m_s: float = Field(0.02, ge=0, description="below it the robot stands still")
     first_frame: Literal["still", "zero_profile"] = Field(
         "still", description="zero_profile: compared with an all-zero profile, as OpenRatSLAM does"
     )
@@ -46,8 +46,8 @@ class ViewConfig(_Section):
     """Local view cells: how a picture becomes a template and when two are the same place."""
 
     crop: Region | None = Field(None, description="x_min, x_max, y_min, y_max in px; none: all")
-    template_width: int = Field(60, ge=2)
-    template_height: int = Field(10, ge=1)
+    template_width: int = Field(60, ge=2, description="px; larger: tells more places apart")
+    template_height: int = Field(10, ge=1, description="px")
     threshold: float = Field(
         0.05, gt=0, lt=1, description="largest mean difference that is a match; larger: fewer views"
     )
@@ -80,15 +80,15 @@ class ViewConfig(_Section):
 class PoseCellConfig(_Section):
     """Pose cells: a continuous attractor on the torus ``(n_theta, n_xy, n_xy)``."""
 
-    n_xy: int = Field(21, ge=7)
-    n_theta: int = Field(36, ge=7)
+    n_xy: int = Field(21, ge=7, description="cells a side; it goes round, so it bounds no map")
+    n_theta: int = Field(36, ge=7, description="cells in a full turn")
     cell_size_m: float = Field(0.25, gt=0, description="side of a cell; larger: coarser places")
     excite_size: int = Field(7, ge=1, description="odd width of the excitation kernel, cells")
-    excite_std_xy: float = Field(1.0, gt=0, description="cells")
-    excite_std_theta: float = Field(1.0, gt=0, description="cells")
+    excite_std_xy: float = Field(1.0, gt=0, description="cells; wider: a broader packet")
+    excite_std_theta: float = Field(1.0, gt=0, description="cells, of heading")
     inhibit_size: int = Field(5, ge=1, description="odd width of the inhibition kernel, cells")
     inhibit_std_xy: float = Field(2.0, gt=0, description="cells")
-    inhibit_std_theta: float = Field(2.0, gt=0, description="cells")
+    inhibit_std_theta: float = Field(2.0, gt=0, description="cells, of heading")
     global_inhibition: float = Field(2e-5, ge=0, description="activity taken from every cell")
     inject_energy: float = Field(
         0.2, ge=0, description="activity a known view adds; larger: quicker relocalisation"
@@ -112,7 +112,7 @@ class PoseCellConfig(_Section):
         2.0, gt=0, description="farther than this from a known place is a new one"
     )
     decode_radius: int = Field(3, ge=0, description="cells around the peak that are averaged")
-    precision: Literal["float32", "float64"] = "float32"
+    precision: Literal["float32", "float64"] = Field("float32", description="of the activity")
 
     @model_validator(mode="after")
     def _kernels_fit(self) -> Self:

@@ -1,6 +1,8 @@
 """Configs: bounds, unknown keys, files, presets, OpenRatSLAM's own files."""
 
+import importlib.util
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -124,3 +126,21 @@ def test_every_classic_name_leads_to_a_field_of_ours():
     config = BrainConfig()
     for section, name in CLASSIC_NAMES.values():
         assert hasattr(getattr(config, section), name)
+
+
+def test_the_page_of_parameters_is_up_to_date():
+    docs = Path(__file__).resolve().parents[1] / "docs"
+    spec = importlib.util.spec_from_file_location("parameters", docs / "parameters.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert (docs / "parameters.md").read_text() == module.page(), "run: python docs/parameters.py"
+
+
+def test_every_parameter_says_what_it_does():
+    for name, field in BrainConfig.model_fields.items():
+        section = getattr(BrainConfig(), name)
+        if hasattr(section, "model_fields"):
+            for key, each in type(section).model_fields.items():
+                assert each.description, f"{name}.{key}"
+        else:
+            assert field.description, name
