@@ -420,7 +420,7 @@ def _draw_map(
         track_xy=trajectory(brain, trace)[:, :2],
         truth_xy=None if truth is None else truth[:, :2],
         current=brain.map.pose,
-        title=f"{Path(plan.source).name}: {len(trace['time_s'])} frames",
+        title=f"{'/'.join(Path(plan.source).parts[-2:])}: {len(trace['time_s'])} frames",
     )
     save(figure, path)
 
