@@ -170,9 +170,9 @@ def test_the_counts_of_a_real_map_are_in_its_title(shared):
     track = integrate_velocities(v, w, np.full(len(v), 0.05))
     left, right = plotting.plot_map(poses, links, odometry_xy=track[:, :2]).get_axes()
     assert left.get_title("right").startswith("2,873 frames · ")
-    assert right.get_title("right") == "1,140 experiences · 1,418 links · 475 loop closures"
-    assert len(segments(right, plotting.LOOP)) == 475
-    assert len(segments(right, plotting.MAP)) == 943
+    assert right.get_title("right") == "1,140 experiences · 1,418 links · 279 loop closures"
+    assert len(segments(right, plotting.LOOP)) == 279
+    assert len(segments(right, plotting.MAP)) == 1139
 
 
 def test_a_metre_is_as_long_upward_as_sideways():

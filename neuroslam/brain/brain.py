@@ -1,5 +1,7 @@
 """The brain: odometry, view, pose cells and map, composed; one frame in, one result out."""
 
+import math
+
 import torch
 from torch import nn
 
@@ -114,10 +116,18 @@ class NavigationBrain(nn.Module):
     def _velocity(self, frame: Frame, dt_s: float) -> Velocity:
         use = self.config.odometry.use
         if use != "visual" and frame.velocity is not None:
-            return frame.velocity
+            if not all(map(math.isfinite, frame.velocity)):
+                raise BadFrame(
+                    f"frame {frame.index}: odometry v = {frame.velocity[0]:g} m/s, "
+                    f"w = {frame.velocity[1]:g} rad/s; expected finite numbers"
+                )
+            return Velocity(*map(float, frame.velocity))
         if use == "given" or frame.image is None:
             raise BadFrame(
                 f"frame {frame.index}: no odometry in the source"
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
-        return self.odometry(frame.image, dt_s)
+        try:
+            return self.odometry(frame.image, dt_s)
+        except BadFrame as fault:
+            raise BadFrame(f"frame {frame.index}: {fault}") from None
