@@ -175,7 +175,7 @@ def experiment_command(
     from neuroslam.experiments import run_experiment
 
     rows = run_experiment(name, data, out)
-    table = Table(*rows[0].keys(), title=name)
+    table = Table(*(key.replace("_", " ") for key in rows[0]), title=name)
     for row in rows:
         table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
     console.print(table)

@@ -17,7 +17,7 @@ def memory(templates, **config):
     height, width = templates.shape[1:]
     cells = LocalViewCells(ViewConfig(template_width=width, template_height=height, **config))
     for template in templates:
-        cells._store(template)
+        cells.learn(template)
     return cells
 
 
@@ -91,7 +91,7 @@ def test_a_thousand_real_queries_find_what_brute_force_finds(shared, monkeypatch
     source = open_source(shared / "data" / "usi_track1" / "frames.tar")
     views = [cells.encode(frame.image) for frame in source.frames(0, 1400)]
     for view in views[:400]:
-        cells._store(view)
+        cells.learn(view)
     templates = stored(cells)
     for view in views[400:]:
         found = cells.search(view)

@@ -159,7 +159,7 @@ def find_nearest(
 
 
 def lower_bounds(blocks: np.ndarray, query: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Bound the distance of every template from below, over all shifts; ``int64``, ``(n,)``."""
+    """Bound the distance of every template from below, over all shifts; ``int32``, ``(n,)``."""
     first, last = geometry.core
     if geometry.panoramic:
         shifted = np.stack([np.roll(query, offset, axis=0) for offset in geometry.offsets])
@@ -171,7 +171,7 @@ def lower_bounds(blocks: np.ndarray, query: np.ndarray, geometry: Geometry) -> n
     means = block_means(shifted, geometry)
     apart, _ = cv2.batchDistance(blocks, means, cv2.CV_32S, normType=cv2.NORM_L1, K=1)
     size = geometry.block[0] * geometry.block[1]
-    return apart[:, 0].astype(np.int64) * size - (size - 1) * geometry.n_blocks
+    return apart[:, 0] * np.int32(size) - np.int32((size - 1) * geometry.n_blocks)
 
 
 def distances(pixels: np.ndarray, query: np.ndarray, geometry: Geometry) -> np.ndarray:

@@ -124,11 +124,12 @@ class LocalViewCells(nn.Module):
             return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
         match = self.search(view, self.config.threshold)
         if match.template == NO_TEMPLATE or match.error > self.config.threshold:
-            match = ViewMatch(self._store(view), match.error, 0.0, True)
+            match = ViewMatch(self.learn(view), match.error, 0.0, True)
         self.last.template = match.template
         return match
 
-    def _store(self, view: np.ndarray) -> int:
+    def learn(self, view: np.ndarray) -> int:
+        """Store a view, as :meth:`encode` makes it, whatever it is like; returns its id."""
         columns = np.ascontiguousarray(view.T)
         pixels = to_bytes(columns)
         row = {

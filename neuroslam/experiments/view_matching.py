@@ -1,0 +1,131 @@
+"""Recognising places of a corridor walked twice: which template tells them apart best?
+
+The recording is 84 photographs and a matrix that marks, below its diagonal, the pairs that show one
+place: those 38 to 42 photographs apart, and at the end 79 to 82. Photographs next to each other are
+not marked although they look alike, so pairs fewer than 20 apart count neither way.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuroslam.config import ViewConfig
+from neuroslam.errors import SourceError
+from neuroslam.evaluation.place import (
+    PrecisionRecall,
+    average_precision,
+    precision_recall,
+    recall_at_full_precision,
+)
+from neuroslam.plotting import plot_precision_recall, save
+from neuroslam.sensors import open_source
+from neuroslam.storage import write_atomically
+from neuroslam.view import LocalViewCells
+
+APART = 20
+"""Photographs nearer in time than this are no question."""
+
+NORMALISATIONS: dict[str, dict[str, float]] = {
+    "plain": {"normalisation": 0.0},
+    "mean-normalised": {"normalisation": 0.5},
+    "patch-normalised": {"normalisation": 0.0, "patch_radius": 8},
+}
+
+SIZES = ((32, 24, 8), (16, 12, 4), (64, 12, 16))
+"""Width and height of the templates, columns they may be shifted by; the first is drawn."""
+
+
+def view_matching(data_folder: Path, out_folder: Path) -> dict[str, Any]:
+    """Match every photograph with the earlier ones, for each kind of template.
+
+    Two questions: of all pairs, which show one place (``pairs``)? And, as a robot asks it, is the
+    nearest earlier view this place (``nearest``; recall counts photographs that have one)?
+
+    Args:
+        data_folder: Holds ``frames/`` and ``loop_truth.bmp``.
+        out_folder: ``results.json`` and ``pr_curves.png`` are written there.
+
+    Returns:
+        The content of ``results.json``: ``rows``.
+
+    Raises:
+        SourceError: If a photograph or the truth cannot be read, or they do not fit.
+    """
+    images = [frame.image for frame in open_source(Path(data_folder) / "frames").frames()]
+    truth = read_truth(Path(data_folder) / "loop_truth.bmp", len(images))
+    rows, curves = [], {}
+    for width, height, shift in SIZES:
+        for name, normalisation in NORMALISATIONS.items():
+            config = ViewConfig(
+                template_width=width, template_height=height, shift_match=shift, **normalisation
+            )
+            distances = distance_matrix(images, config)
+            pairs, nearest = pair_curve(distances, truth), nearest_curve(distances, truth)
+            rows.append(
+                {
+                    "templates": name,
+                    "width_px": width,
+                    "height_px": height,
+                    "shift_columns": shift,
+                    "pairs_average_precision": average_precision(pairs),
+                    "nearest_average_precision": average_precision(nearest),
+                    "nearest_recall_at_full_precision": recall_at_full_precision(nearest),
+                }
+            )
+            if (width, height, shift) == SIZES[0]:
+                precision = average_precision(nearest)
+                curves[f"{name}, AP {precision:.2f}"] = (nearest.precision, nearest.recall)
+    result = {"rows": rows, "photographs": len(images), "true_pairs": int(truth.sum())}
+    out = Path(out_folder)
+    text = json.dumps(result, indent=2) + "\n"
+    write_atomically(out / "results.json", lambda file: file.write_text(text, encoding="utf-8"))
+    save(plot_precision_recall(curves), out / "pr_curves.png")
+    return result
+
+
+def read_truth(path: Path, n: int) -> np.ndarray:
+    """Read which pairs show one place: boolean, ``(n, n)``, below the diagonal.
+
+    Raises:
+        SourceError: If it cannot be read or is not ``n`` by ``n``.
+    """
+    marks = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if marks is None or marks.shape != (n, n):
+        got = "missing or no picture" if marks is None else f"{marks.shape} px"
+        raise SourceError(f"{path}: {got}; expected the {n}x{n} matrix of places")
+    return np.tril(marks > 0)
+
+
+def distance_matrix(images: list[np.ndarray], config: ViewConfig) -> np.ndarray:
+    """Compare every picture with every other as the view cells do: ``(n, n)``, grey in [0, 1]."""
+    views = [LocalViewCells(config).encode(image) for image in images]
+    found = np.zeros((len(views), len(views)))
+    for j, view in enumerate(views):
+        cells = LocalViewCells(config)
+        cells.learn(view)
+        for i, other in enumerate(views):
+            found[i, j] = cells.search(other).error
+    return found
+
+
+def _asked(n: int) -> np.ndarray:
+    i, j = np.indices((n, n))
+    return i - j >= APART
+
+
+def pair_curve(distances: np.ndarray, truth: np.ndarray) -> PrecisionRecall:
+    """Rank all pairs that are asked about by their distance."""
+    asked = _asked(len(truth))
+    return precision_recall(distances[asked], truth[asked])
+
+
+def nearest_curve(distances: np.ndarray, truth: np.ndarray) -> PrecisionRecall:
+    """Rank each picture's nearest earlier one; pictures of a new place should find none."""
+    asked = _asked(len(truth))
+    some = np.flatnonzero(asked.any(axis=1))
+    at = np.where(asked, distances, np.inf)[some].argmin(axis=1)
+    findable = int((truth & asked).any(axis=1).sum())
+    return precision_recall(distances[some, at], truth[some, at], findable)
