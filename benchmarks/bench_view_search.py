@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.config import ViewConfig
@@ -32,12 +33,10 @@ def noise(n: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((n, 10, 60))
 
 
-def memory(templates: np.ndarray) -> LocalViewCells:
-    cells = LocalViewCells(CONFIG)
+def memory(templates: np.ndarray, config: ViewConfig = CONFIG) -> LocalViewCells:
+    cells = LocalViewCells(config)
     pixels = to_bytes(templates.transpose(0, 2, 1))
     blocks = np.concatenate([template_blocks(t, cells.geometry)[None] for t in pixels])
-    import torch
-
     cells.templates.replace(
         pixels=torch.from_numpy(pixels.reshape(len(pixels), -1)), blocks=torch.from_numpy(blocks)
     )

@@ -40,7 +40,7 @@ class GrowingTable(nn.Module):
         if self.n == self._buffers[self.columns[0]].shape[0]:
             self.reserve(max(16, 2 * self.n))
         for name in self.columns:
-            self._buffers[name][self.n] = torch.as_tensor(row[name])
+            self._buffers[name][self.n] = row[name]
         self.n += 1
         return self.n - 1
 

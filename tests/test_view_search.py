@@ -100,10 +100,11 @@ def test_a_thousand_real_queries_find_what_brute_force_finds(shared, monkeypatch
         assert found.error == pytest.approx(error, abs=1e-12)
 
 
-def test_a_panorama_finds_what_brute_force_finds(monkeypatch):
+@pytest.mark.parametrize("precision", ["uint8", "float64"])
+def test_a_panorama_finds_what_brute_force_finds(monkeypatch, precision):
     monkeypatch.setattr(search, "PRUNE_FROM", 100)
     rng = np.random.default_rng(3)
-    cells = memory(smooth(rng, 300), panoramic=True, shift_step=2, threshold=0.05)
+    cells = memory(smooth(rng, 300), panoramic=True, shift_step=2, precision=precision)
     templates = stored(cells)
     for _ in range(60):
         view = np.roll(templates[rng.integers(300)], rng.integers(60), axis=1)

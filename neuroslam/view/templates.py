@@ -21,6 +21,10 @@ GATE_MARGIN = 0.005
 """Added to the threshold where templates are skipped for their mean, as OpenRatSLAM does."""
 
 
+_AT_ONCE = 1024
+"""Comparisons in full precision that are made together: some megabytes."""
+
+
 class LocalViewCells(nn.Module):
     r"""Stores views as templates and recognises them.
 
@@ -166,19 +170,16 @@ class LocalViewCells(nn.Module):
             error = apart[shifts[first], rows[first]] / (255.0 * g.n_pixels)
             return Nearest(int(ids[rows[first]]), 0, g.offsets[shifts[first]]), float(error)
         values = self.templates["values"].numpy(force=True).reshape(self.n, g.width, g.height)
+        offsets = np.array(g.offsets)[shifts]
+        part = view[g.margin : g.margin + g.overlap]
         errors = np.empty(len(rows))
-        for shift in np.unique(shifts):
-            at = shifts == shift
-            offset = g.offsets[shift]
-            over, part = values[ids[rows[at]]], view
-            if g.panoramic:
-                part = np.roll(view, offset, axis=0)
-            else:
-                over = over[:, offset : offset + g.overlap]
-                part = view[g.margin : g.margin + g.overlap]
-            errors[at] = np.abs(over - part).reshape(len(over), -1).mean(axis=1)
+        for at in range(0, len(rows), _AT_ONCE):
+            some = slice(at, at + _AT_ONCE)
+            columns = (offsets[some, None] + np.arange(g.overlap)) % g.width
+            apart = np.abs(values[ids[rows[some], None], columns] - part)
+            errors[some] = apart.reshape(len(apart), -1).mean(axis=1)
         best = np.lexsort((shifts, rows, errors))[0]
-        return Nearest(int(ids[rows[best]]), 0, g.offsets[shifts[best]]), float(errors[best])
+        return Nearest(int(ids[rows[best]]), 0, int(offsets[best])), float(errors[best])
 
     def _relative_heading(self, offset: int) -> float:
         """Heading now minus heading when learnt: rolling right undoes a turn to the right."""
