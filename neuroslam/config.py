@@ -159,6 +159,7 @@ class BrainConfig(_Section):
     pose_cells: PoseCellConfig = PoseCellConfig()
     map: MapConfig = MapConfig()
     frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
+    threads: int = Field(1, ge=1, description="of a run; for one brain, one is the fastest")
     max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import signal
 import threading
 import time
@@ -229,7 +228,7 @@ def _drive(
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         with (
-            _one_thread(),
+            _threads(brain.config.threads),
             torch.inference_mode(),
             contextlib.closing(recorder),
             _asked_to_stop() as asked,
@@ -266,11 +265,11 @@ def _and_why(skipped: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread is faster for one brain: its arrays are too small to share."""
+def _threads(n: int) -> Iterator[None]:
+    """One is faster than more for one brain: its arrays are too small to share."""
     torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(int(os.environ.get("NEUROSLAM_THREADS", "1")))
-    cv2.setNumThreads(1)
+    torch.set_num_threads(n)
+    cv2.setNumThreads(n)
     try:
         yield
     finally:
