@@ -82,7 +82,7 @@ def settle(
     field = coupled.theta @ planes.flatten(-4, -3).flatten(-2, -1)  # (..., a', b' c')
     field = (field - global_inhibition).clamp_min(0.0)
     total = field.sum((-2, -1), keepdim=True)
-    if bool((total <= 0.0).any()):
+    if total.min().item() <= 0.0:
         raise MapError(
             "pose cells: inhibition silenced every cell; global_inhibition "
             f"{global_inhibition:g} is above all activity, lower it"
