@@ -29,7 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-console = Console()
+console = Console(markup=False, soft_wrap=True)  # for paths: brackets in them, one line each
 
 INTERRUPTED = 130
 USER_ERROR = 2
@@ -53,8 +53,9 @@ def run_command(
     source: Annotated[
         str,
         typer.Argument(
+            metavar="SOURCE",
             help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-            "or world:NAME."
+            "or world:NAME.",
         ),
     ],
     out: Out,
@@ -63,7 +64,8 @@ def run_command(
         Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
     ] = None,
     assignments: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value; laid over both.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
     ] = None,
     start: Annotated[int, typer.Option(help="First frame.")] = 0,
     stop: Stop = None,
@@ -71,13 +73,15 @@ def run_command(
         OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
     ] = OnBadFrame.stop,
     no_tensorboard: NoTensorboard = False,
-    overwrite: Annotated[bool, typer.Option(help="Replace an earlier run in the folder.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+    ] = False,
 ) -> int:
-    """Map a SOURCE and write the map, the track, figures and the brain into a folder."""
+    """Map a SOURCE; write map, track and brain into a folder."""
     from neuroslam.runs import resolve_config, run
 
     settings = resolve_config(preset, config, tuple(assignments or ()))
-    with _progress(source) as on_step:
+    with _progress(source) as (on_start, on_step):
         summary = run(
             source,
             out,
@@ -88,6 +92,7 @@ def run_command(
             tensorboard=not no_tensorboard,
             overwrite=overwrite,
             on_step=on_step,
+            on_start=on_start,
         )
     return _report(summary, out, "run")
 
@@ -97,18 +102,20 @@ def resume_command(out: RunFolder, stop: Stop = None, no_tensorboard: NoTensorbo
     """Go on where the run in DIR stopped."""
     from neuroslam.runs import resume
 
-    with _progress(str(out)) as on_step:
-        summary = resume(out, stop=stop, tensorboard=not no_tensorboard, on_step=on_step)
+    with _progress(str(out)) as (on_start, on_step):
+        summary = resume(
+            out, stop=stop, tensorboard=not no_tensorboard, on_step=on_step, on_start=on_start
+        )
     return _report(summary, out, "resume")
 
 
 @app.command("demo")
 def demo_command(out: Out = Path("demo")) -> int:
-    """Map an embedded world in two sessions, and show what came of it."""
+    """Map an embedded world in two sessions."""
     from neuroslam.demo import demo
 
-    with _progress("world:corridor") as on_step:
-        rows = demo(out, on_step)
+    with _progress("world:corridor") as (on_start, on_step):
+        rows = demo(out, on_step, on_start)
     table = Table(title="Two laps of a corridor, brain saved and reloaded between them")
     table.add_column("what")
     table.add_column("figure", justify="right")
@@ -121,14 +128,16 @@ def demo_command(out: Out = Path("demo")) -> int:
 
 @app.command("evaluate")
 def evaluate_command(
-    track: Annotated[Path, typer.Argument(help="A run's folder, or a track as a TUM file.")],
+    track: Annotated[
+        Path, typer.Argument(metavar="TRACK", help="A run's folder, or a track as a TUM file.")
+    ],
     truth: Annotated[
         Path | None, typer.Option(help="True track, TUM; a run of a world has its own.")
     ] = None,
     align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
 ) -> int:
-    """Compare a track with the truth: absolute and relative error."""
-    from neuroslam.runs import evaluate
+    """Compare a track with the truth."""
+    from neuroslam.review import evaluate
 
     table = Table(title=f"{track} against the truth, {align} alignment")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
@@ -144,8 +153,8 @@ def plot_command(
     out: RunFolder,
     to: Annotated[Path | None, typer.Option(help="Folder for the figures; DIR itself.")] = None,
 ) -> int:
-    """Draw the figures of a run: map, pose cells, counts over time."""
-    from neuroslam.runs import plot
+    """Draw the map, the pose cells and counts over time."""
+    from neuroslam.review import plot
 
     for path in plot(out, to or out):
         console.print(str(path))
@@ -167,11 +176,11 @@ def presets_command() -> int:
 
 @app.command("experiment")
 def experiment_command(
-    name: Annotated[str, typer.Argument(help="corridor-loops or view-matching.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="corridor-loops or view-matching.")],
     out: Out,
     data: Annotated[Path, typer.Option(help="Folder of the recordings.")] = Path("../shared/data"),
 ) -> int:
-    """Repeat an experiment on real recordings: results.json, a table and figures."""
+    """Repeat an experiment on real recordings."""
     from neuroslam.experiments import run_experiment
 
     rows = run_experiment(name, data, out)
@@ -184,22 +193,33 @@ def experiment_command(
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Callable[["StepResult"], None]]:
-    """Show frames, frames/s, templates and experiences while a run goes."""
+def _progress(
+    name: str,
+) -> Iterator[tuple[Callable[[int | None], None], Callable[["StepResult"], None]]]:
+    """Show frame, frames/s, views and places while a run goes; yield what tells them."""
     columns = (
-        TextColumn("[bold]{task.description}"),
-        BarColumn(bar_width=20),
+        TextColumn("{task.description}", style="bold", markup=False),
+        BarColumn(bar_width=12),
         TaskProgressColumn(),
-        TextColumn("{task.completed:.0f} frames, {task.fields[rate]:.0f}/s"),
-        TextColumn("{task.fields[templates]} templates, {task.fields[experiences]} experiences"),
+        TextColumn("{task.completed:.0f}, {task.fields[rate]:.0f}/s"),
+        TextColumn("{task.fields[templates]} views, {task.fields[experiences]} places"),
         TimeElapsedColumn(),
     )
     import time
 
-    shown = Path(name).name or name
-    with Progress(*columns, console=console, transient=True, refresh_per_second=5) as bar:
+    shown = (Path(name).name or name)[:18]  # all of it fits 80 columns
+    on_screen = console.is_terminal
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=5, disable=not on_screen
+    ) as bar:
         task = bar.add_task(shown, total=None, rate=0.0, templates=0, experiences=0)
-        began, done, last = time.perf_counter(), 0, 0.0
+        began = last = 0.0
+        done = 0
+
+        def on_start(end: int | None) -> None:
+            nonlocal began, done
+            began, done = time.perf_counter(), 0
+            bar.update(task, total=end)
 
         def on_step(result: "StepResult") -> None:
             nonlocal done, last
@@ -209,13 +229,13 @@ def _progress(name: str) -> Iterator[Callable[["StepResult"], None]]:
                 last = now
                 bar.update(
                     task,
-                    completed=done,
+                    completed=result.frame + 1,
                     rate=done / (now - began),
                     templates=result.n_templates,
                     experiences=result.n_experiences,
                 )
 
-        yield on_step
+        yield on_start, on_step
 
 
 def _report(summary: "RunSummary", out: Path, command: str) -> int:
@@ -253,7 +273,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
     command = arguments[0] if arguments else ""
     try:
-        return app(args=arguments, standalone_mode=False) or 0
+        return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except (typer.Abort, KeyboardInterrupt):
         _complain(command, "interrupted")
         return INTERRUPTED

@@ -7,9 +7,16 @@ import numpy as np
 
 from neuroslam.brain import load_brain
 from neuroslam.config import BrainConfig
+from neuroslam.errors import RunError
 from neuroslam.plotting import plot_summary, save
-from neuroslam.run_files import odometry_track, read_frames, read_trace, trajectory
-from neuroslam.runs import read_plan, resume, run
+from neuroslam.run_files import (
+    odometry_track,
+    read_frames,
+    read_plan,
+    read_trace,
+    trajectory,
+)
+from neuroslam.runs import resume, run
 from neuroslam.sensors import open_source
 from neuroslam.types import StepResult
 
@@ -17,18 +24,26 @@ WORLD = "world:corridor?laps=2&noise=0.05"
 
 
 def demo(
-    out: str | Path, on_step: Callable[[StepResult], None] | None = None
+    out: str | Path,
+    on_step: Callable[[StepResult], None] | None = None,
+    on_start: Callable[[int | None], None] | None = None,
 ) -> list[tuple[str, str]]:
     """Map two laps of a corridor: one, save, reload, the other; and draw what came of it.
 
     Args:
         out: Folder for the files of the run and ``summary.png``; an earlier demo there is replaced.
         on_step: Called after each frame.
+        on_start: Called before each session, with the frame at which it ends.
 
     Returns:
         What was measured, as names and figures to print.
+
+    Raises:
+        RunError: If the folder holds another run, or cannot be written.
     """
     out = Path(out)
+    if (out / "frames.csv").exists() and read_plan(out).source != WORLD:
+        raise RunError(f"{out}: holds a run of something else; take another folder")
     n_frames = open_source(WORLD).n_frames
     first = run(
         WORLD,
@@ -37,9 +52,10 @@ def demo(
         stop=n_frames // 2,
         overwrite=True,
         on_step=on_step,
+        on_start=on_start,
     )
     after_one_lap = first.counts
-    summary = resume(out, on_step=on_step)
+    summary = resume(out, on_step=on_step, on_start=on_start)
     draw_summary(out, out / "summary.png")
     figures = summary.to_dict()
     return [

@@ -2,7 +2,7 @@
 
 
 class NeuroslamError(Exception):
-    """Base of every error that neuroslam raises on purpose; the command line prints it as one line."""
+    """Base of all errors that neuroslam raises on purpose; the command line prints one line."""
 
 
 class ConfigError(NeuroslamError, ValueError):

@@ -7,6 +7,7 @@ import numpy as np
 from neuroslam.types import Pose
 
 TWO_PI = 2.0 * math.pi
+ORIGIN = Pose(0.0, 0.0, 0.0)
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -57,7 +58,7 @@ def relative(first: Pose, second: Pose) -> Pose:
 
 
 def integrate_velocities(
-    v_m_s: np.ndarray, w_rad_s: np.ndarray, dt_s: np.ndarray, start: Pose = Pose(0.0, 0.0, 0.0)
+    v_m_s: np.ndarray, w_rad_s: np.ndarray, dt_s: np.ndarray, start: Pose = ORIGIN
 ) -> np.ndarray:
     """Dead-reckon a track: turn first, then move along the new heading, as the experience map does.
 

@@ -1,12 +1,15 @@
 """The files of a run: their names and columns are a contract, and nothing else writes them."""
 
 import contextlib
+import json
 import math
 import os
 import shutil
+import tomllib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import BinaryIO, Literal, TextIO
 
 import numpy as np
 
@@ -29,6 +32,51 @@ TRACE_COLUMNS = (
     "truth_x_m", "truth_y_m", "truth_theta_rad",
 )  # fmt: skip
 
+RUN_FILES = (
+    "frames.csv", "trace.f64", "config.toml", "metrics.json", "brain.safetensors",
+    "experiences.csv", "links.csv", "trajectory.tum", "map.png",
+)  # fmt: skip
+
+
+OnBadFrame = Literal["skip", "stop"]
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What a run reads and how far: the ``[run]`` table of its ``config.toml``."""
+
+    source: str
+    start: int = 0
+    stop: int | None = None
+    on_bad_frame: OnBadFrame = "stop"
+
+    @property
+    def skips(self) -> bool:
+        """Whether frames that cannot be used are left out."""
+        return self.on_bad_frame == "skip"
+
+    def to_toml(self) -> str:
+        """Write the table."""
+        lines = [f"source = {json.dumps(self.source, ensure_ascii=False)}", f"start = {self.start}"]
+        if self.stop is not None:
+            lines.append(f"stop = {self.stop}")
+        lines.append(f'on_bad_frame = "{self.on_bad_frame}"')
+        return "\n".join(["\n[run]", *lines]) + "\n"
+
+
+def require_free(out: Path, source: str, overwrite: bool) -> None:
+    """Make sure that a new run in a folder destroys nothing that it should not.
+
+    Raises:
+        RunError: If ``out`` is a file, is or holds the source, or holds a run already.
+    """
+    if out.exists() and not out.is_dir():
+        raise RunError(f"{out}: is a file; expected a folder to write")
+    if Path(source) in (out.resolve(), *(out.resolve() / name for name in RUN_FILES)):
+        raise RunError(f"{out}: is where the source is, which would change; take another folder")
+    if not overwrite and any((out / name).exists() for name in RUN_FILES):
+        raise RunError(f"{out}: holds a run already; resume it, take another folder or --overwrite")
+
 
 class RowWriter:
     """Writes the two files that grow by a row a frame: ``frames.csv`` and ``trace.f64``."""
@@ -42,9 +90,10 @@ class RowWriter:
         """Start the files of a new run, in place of an earlier one's."""
         try:
             out.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(out / "events", ignore_errors=True)
-            (out / "brain.safetensors").unlink(missing_ok=True)  # it would not fit the new rows
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
+                shutil.rmtree(out / "events", ignore_errors=True)
+                for name in RUN_FILES[2:]:  # none would fit the new rows
+                    (out / name).unlink(missing_ok=True)
                 frames.write(FRAME_COLUMNS + "\n")
                 yield cls(frames, trace)
         except OSError as error:
@@ -73,8 +122,11 @@ class RowWriter:
                 trace.truncate(rows * row_bytes)
                 trace.seek(0, os.SEEK_END)
                 yield cls(frames, trace)
-        except FileNotFoundError as error:
-            raise RunError(f"{error.filename}: missing; cannot resume") from None
+        except OSError as error:
+            raise RunError(
+                f"{error.filename or out}: cannot be used ({error.strerror or error}); "
+                "cannot resume"
+            ) from None
 
     def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
         """Append the rows of one frame."""
@@ -96,17 +148,25 @@ class RowWriter:
         self.trace.write(np.array(row, dtype="<f8").tobytes())
 
 
-def read_trace(out: str | Path) -> dict[str, np.ndarray]:
+def read_trace(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
     """Read ``trace.f64`` of a run: one array for each of ``TRACE_COLUMNS``.
 
+    Args:
+        out: Folder of the run.
+        rows: So many, without what a killed run wrote after its last save; ``None``: all.
+
     Raises:
-        RunError: If there is none.
+        RunError: If there is none, or it has fewer rows.
     """
     path = Path(out) / "trace.f64"
     if not path.is_file():
         raise RunError(f"{path}: missing; is {out} a run?")
-    rows = np.fromfile(path, dtype="<f8").reshape(-1, len(TRACE_COLUMNS))
-    return {name: rows[:, i] for i, name in enumerate(TRACE_COLUMNS)}
+    values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
+    there = len(values) // width
+    if there < (rows or 1):
+        raise RunError(f"{path}: damaged, {there} whole rows; expected {rows or 'some'}")
+    table = values[: (rows or there) * width].reshape(-1, width)
+    return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
 
 
 def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
@@ -156,8 +216,12 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
-def read_frames(out: str | Path) -> dict[str, np.ndarray]:
+def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
     """Read the columns of ``frames.csv`` that hold numbers, each as an array.
+
+    Args:
+        out: Folder of the run.
+        rows: As for :func:`read_trace`.
 
     Raises:
         RunError: If there is none, or it is damaged.
@@ -166,9 +230,34 @@ def read_frames(out: str | Path) -> dict[str, np.ndarray]:
     names = FRAME_COLUMNS.split(",")
     numbers = [i for i, name in enumerate(names) if name != "action"]
     try:
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=numbers, ndmin=2)
+        table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=numbers, ndmin=2, max_rows=rows)
     except FileNotFoundError:
         raise RunError(f"{path}: missing; is {out} a run?") from None
     except (ValueError, IndexError) as error:
         raise RunError(f"{path}: damaged ({error})") from None
-    return {names[i]: rows[:, column] for column, i in enumerate(numbers)}
+    return {names[i]: table[:, column] for column, i in enumerate(numbers)}
+
+
+def read_plan(out: str | Path) -> RunPlan:
+    """Read what a run was made from, out of its ``config.toml``.
+
+    Raises:
+        RunError: If the folder holds no run.
+    """
+    path = Path(out) / "config.toml"
+    try:
+        return RunPlan(**tomllib.loads(path.read_text(encoding="utf-8"))["run"])
+    except OSError:
+        if (Path(out) / "frames.csv").exists():
+            raise RunError(
+                f"{out}: was cut off before anything was saved; run it again with --overwrite"
+            ) from None
+        raise RunError(f"{out}: not a run, it has no config.toml") from None
+    except (KeyError, TypeError, ValueError):  # not TOML, not text, or not of a run
+        raise RunError(f"{path}: has no usable [run] table; is it of a run?") from None
+
+
+def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return the true pose of every frame, ``(frames, 3)``, or ``None`` where it is not known."""
+    truth = np.column_stack([trace[f"truth_{name}"] for name in ("x_m", "y_m", "theta_rad")])
+    return truth if np.isfinite(truth).all() else None

@@ -5,14 +5,13 @@ import json
 import signal
 import threading
 import time
-import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import cv2
-import numpy as np
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
@@ -25,57 +24,27 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
-from neuroslam.errors import BadFrame, CheckpointError, RunError
-from neuroslam.evaluation.trajectory import (
-    AlignmentMode,
-    ErrorStatistics,
-    Track,
-    absolute_trajectory_error,
-    associate,
-    read_tum,
-    relative_pose_error,
-    write_tum,
-)
+from neuroslam.errors import BadFrame, MapError, RunError, SourceError
+from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.experience import closes_loop
-from neuroslam.plotting import plot_map, plot_pose_cells, plot_signals, save
 from neuroslam.recording import NullRecorder, Recorder, TensorBoardRecorder
+from neuroslam.review import draw_map
 from neuroslam.run_files import (
+    OnBadFrame,
     RowWriter,
+    RunPlan,
     experiences_csv,
     links_csv,
     odometry_track,
-    read_frames,
+    read_plan,
     read_trace,
+    require_free,
     trajectory,
+    true_poses,
     write_text,
 )
 from neuroslam.sensors import Source, open_source
-from neuroslam.types import StepResult
-
-OnBadFrame = Literal["skip", "stop"]
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """What a run reads and how far: the ``[run]`` table of its ``config.toml``."""
-
-    source: str
-    start: int = 0
-    stop: int | None = None
-    on_bad_frame: OnBadFrame = "stop"
-
-    @property
-    def skips(self) -> bool:
-        """Whether frames that cannot be used are left out."""
-        return self.on_bad_frame == "skip"
-
-    def to_toml(self) -> str:
-        """Write the table."""
-        lines = [f"source = {json.dumps(self.source)}", f"start = {self.start}"]
-        if self.stop is not None:
-            lines.append(f"stop = {self.stop}")
-        lines.append(f'on_bad_frame = "{self.on_bad_frame}"')
-        return "\n".join(["\n[run]", *lines]) + "\n"
+from neuroslam.types import Frame, StepResult
 
 
 @dataclass
@@ -144,6 +113,7 @@ def run(
     tensorboard: bool = True,
     overwrite: bool = False,
     on_step: Callable[[StepResult], None] | None = None,
+    on_start: Callable[[int | None], None] | None = None,
 ) -> RunSummary:
     """Map a source and write the run's files into a folder.
 
@@ -157,6 +127,7 @@ def run(
         tensorboard: Write ``events/`` too.
         overwrite: Replace the files of an earlier run in ``out``.
         on_step: Called after each frame, e.g. to show progress.
+        on_start: Called once, with the number of the frame to stop before; ``None``: unknown.
 
     Returns:
         What was done; a bad frame under ``stop`` ends the run, whose files are still written,
@@ -169,18 +140,23 @@ def run(
     out = Path(out)
     config = config or BrainConfig()
     if start < 0 or (stop is not None and stop <= start):
-        raise RunError(f"frames {start} to {stop}: need 0 <= start < stop")
+        raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
     plan = RunPlan(_absolute(source), start, stop, on_bad_frame)
+    require_free(out, plan.source, overwrite)
     opened = open_source(source, config.frame_rate_hz)  # first: nothing is written if it fails
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(f"{source}: has {opened.n_frames} frames, none from --start {start} on")
-    if (out / "brain.safetensors").exists() and not overwrite:
-        raise RunError(f"{out}: holds a run already; resume it, take another folder or --overwrite")
-    brain = NavigationBrain(config)
-    with RowWriter.create(out) as output:
-        recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-        summary = _drive(brain, opened, plan, output, recorder, RunSummary(), on_step)
-    return _finish(brain, plan, out, summary)
+    brain, summary = NavigationBrain(config), RunSummary()
+    _announce(on_start, stop, opened)
+    with _threads(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+        steps = _steps(brain, opened, plan, summary)
+        first = next(steps, None)  # an earlier run is not touched before this works
+        if first is None:
+            raise RunError(f"{source}: no usable frame{_and_why(summary.skipped)}")
+        with RowWriter.create(out) as output:
+            recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
+            _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked)
+        return _finish(brain, plan, out, summary)
 
 
 def resume(
@@ -189,6 +165,7 @@ def resume(
     stop: int | None = None,
     tensorboard: bool = True,
     on_step: Callable[[StepResult], None] | None = None,
+    on_start: Callable[[int | None], None] | None = None,
 ) -> RunSummary:
     """Go on where a run stopped; its files end up equal to those of an uncut run.
 
@@ -197,67 +174,79 @@ def resume(
         stop: Frame to stop before; the end of the source if not given.
         tensorboard: Append to ``events/`` too.
         on_step: Called after each frame.
+        on_start: As for :func:`run`.
 
     Raises:
-        RunError: If the folder holds no run, or parts of it are missing.
+        RunError: If the folder holds no run, parts of it are missing, or it is past ``stop``.
         CheckpointError: If its brain cannot be loaded.
     """
     out = Path(out)
     plan = replace(read_plan(out), stop=stop)
     brain = load_brain(out / "brain.safetensors")
-    opened = open_source(plan.source, brain.config.frame_rate_hz)
     seen, first = brain.clock.frames_seen, brain.clock.frame + 1
+    if stop is not None and stop < first:
+        raise RunError(f"{out}: is at frame {first} already; --stop {stop} is behind that")
+    opened = open_source(plan.source, brain.config.frame_rate_hz)
     summary = _read_summary(out)
-    with RowWriter.reopen(out, seen) as output:
-        recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-        onward = replace(plan, start=max(first, plan.start))
-        summary = _drive(brain, opened, onward, output, recorder, summary, on_step)
-    return _finish(brain, plan, out, summary)
+    _announce(on_start, stop, opened)
+    onward = replace(plan, start=max(first, plan.start))
+    with _threads(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+        steps = _steps(brain, opened, onward, summary)
+        with RowWriter.reopen(out, seen) as output:
+            recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
+            _drive(brain, steps, output, recorder, summary, on_step, asked)
+        return _finish(brain, plan, out, summary)
+
+
+def _announce(
+    on_start: Callable[[int | None], None] | None, stop: int | None, source: Source
+) -> None:
+    if on_start is not None:
+        on_start(min((n for n in (stop, source.n_frames) if n is not None), default=None))
+
+
+def _steps(
+    brain: NavigationBrain, source: Source, plan: RunPlan, summary: RunSummary
+) -> Iterator[tuple[Frame, StepResult]]:
+    """Yield each frame with what the brain made of it; skipped ones are noted."""
+    skip = (lambda fault: summary.skipped.append(str(fault))) if plan.skips else None
+    for frame in source.frames(plan.start, plan.stop, skip):
+        try:
+            result = brain(frame)
+        except BadFrame as error:
+            if skip is None:
+                raise
+            skip(error)
+        else:
+            yield frame, result
 
 
 def _drive(
     brain: NavigationBrain,
-    source: Source,
-    plan: RunPlan,
+    steps: Iterable[tuple[Frame, StepResult]],
     output: RowWriter,
     recorder: Recorder,
     summary: RunSummary,
     on_step: Callable[[StepResult], None] | None,
-) -> RunSummary:
-    skip = (lambda fault: summary.skipped.append(str(fault))) if plan.skips else None
+    asked: list[int],
+) -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     try:
-        with (
-            _threads(brain.config.threads),
-            torch.inference_mode(),
-            contextlib.closing(recorder),
-            _asked_to_stop() as asked,
-        ):
-            for frame in source.frames(plan.start, plan.stop, skip):
-                try:
-                    result = brain(frame)
-                except BadFrame as error:
-                    if skip is None:
-                        raise
-                    skip(error)
-                    continue
+        with contextlib.closing(recorder):
+            for frame, result in steps:
                 output.write(result, frame, brain)
                 recorder.step(result, frame, brain)
-                summary.frames += 1
                 if on_step is not None:
                     on_step(result)
                 if asked:
                     break
-        summary.interrupted = bool(asked)
-    except BadFrame as error:
-        if not brain.clock.frames_seen:
-            raise
+    except (SourceError, MapError) as error:  # what was mapped so far is kept
         summary.failure = str(error)
+    summary.interrupted = bool(asked)
+    # A resumed run meets again the bad frames after its last good one: they count once.
+    summary.skipped = list(dict.fromkeys(summary.skipped))
     summary.seconds += time.perf_counter() - wall
     summary.cpu_seconds += time.process_time() - cpu
-    if not brain.clock.frames_seen:
-        raise RunError(f"{plan.source}: no usable frame" + _and_why(summary.skipped))
-    return summary
 
 
 def _and_why(skipped: list[str]) -> str:
@@ -302,8 +291,9 @@ def _asked_to_stop() -> Iterator[list[int]]:
 def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> RunSummary:
     trace = read_trace(out)
     track = trajectory(brain, trace)
-    truth = _truth(trace)
+    truth = true_poses(trace)
     odometry = odometry_track(brain.config, trace)
+    summary.frames = brain.clock.frames_seen
     summary.counts = {
         "templates": brain.view.n,
         "experiences": brain.map.n,
@@ -311,121 +301,32 @@ def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummar
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
     if truth is not None:
-        summary.accuracy = {
-            f"{name}_rmse_m": absolute_trajectory_error(found[:, :2], truth[:, :2], "rigid").rmse
-            for name, found in (("ate", track), ("odometry_ate", odometry))
-        }
+        # A robot that has not moved: nothing tells how to lay its track over the truth.
+        with contextlib.suppress(MapError):
+            summary.accuracy = {
+                f"{name}_rmse_m": absolute_trajectory_error(xy[:, :2], truth[:, :2], "rigid").rmse
+                for name, xy in (("ate", track), ("odometry_ate", odometry))
+            }
     try:
-        save_brain(brain, out / "brain.safetensors")
+        # What cannot be made again comes first: one who kills the run now can still resume it.
         write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
+        write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
+        save_brain(brain, out / "brain.safetensors")
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
         write_tum(out / "trajectory.tum", Track(trace["time_s"], track))
-        write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
-        _draw_map(brain, plan, trace, out / "map.png")
+        draw_map(brain, plan, trace, out / "map.png")
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary
 
 
-def evaluate(
-    track: str | Path, truth: str | Path | None = None, align: AlignmentMode = "rigid"
-) -> list[tuple[str, ErrorStatistics, str]]:
-    """Compare a run, or any TUM file, with the true track.
-
-    Args:
-        track: Folder of a run, or a TUM file.
-        truth: TUM file; a run of a source that knows its truth needs none.
-        align: How the track is laid over the truth before it is compared.
-
-    Returns:
-        Name of the error, its statistics, its unit.
-
-    Raises:
-        NeuroslamError: If a file is missing or damaged, or there is no truth to compare with.
-    """
-    track, source = Path(track), None
-    if align not in get_args(AlignmentMode):
-        raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
-    if track.is_dir():
-        source = read_trace(track)
-        track = track / "trajectory.tum"
-    found = read_tum(track)
-    if truth is not None:
-        true = read_tum(Path(truth))
-        i, j = associate(found.times_s, true.times_s)
-        estimate, reference = found.poses[i], true.poses[j]
-    else:
-        reference = None if source is None else _truth(source)
-        if reference is None:
-            raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
-        estimate = found.poses
-    relative = relative_pose_error(estimate, reference)
-    return [
-        (
-            "absolute (ATE)",
-            absolute_trajectory_error(estimate[:, :2], reference[:, :2], align),
-            "m",
-        ),
-        ("relative, a frame", relative.translation_m, "m"),
-        ("relative, a frame", relative.rotation_rad, "rad"),
-    ]
-
-
-def plot(out: str | Path, to: str | Path) -> list[Path]:
-    """Draw the figures of a run: map, pose cells at its end, recognition and counts over time.
-
-    Returns:
-        The files that were written.
-    """
-    out, to = Path(out), Path(to)
-    brain, plan, trace = load_brain(out / "brain.safetensors"), read_plan(out), read_trace(out)
-    to.mkdir(parents=True, exist_ok=True)
-    _draw_map(brain, plan, trace, to / "map.png")
-    cells = brain.pose_cells
-    save(plot_pose_cells(cells.activity.numpy(), cells.estimate), to / "pose_cells.png")
-    save(plot_signals(read_frames(out), brain.config.view.threshold), to / "signals.png")
-    return [to / name for name in ("map.png", "pose_cells.png", "signals.png")]
-
-
-def read_plan(out: str | Path) -> RunPlan:
-    """Read what a run was made from, out of its ``config.toml``.
-
-    Raises:
-        RunError: If the folder holds no run.
-    """
-    path = Path(out) / "config.toml"
-    try:
-        return RunPlan(**tomllib.loads(path.read_text(encoding="utf-8"))["run"])
-    except FileNotFoundError:
-        raise RunError(f"{out}: not a run, it has no config.toml") from None
-    except (KeyError, TypeError, tomllib.TOMLDecodeError):
-        raise RunError(f"{path}: has no usable [run] table; is it of a run?") from None
-
-
-def _truth(trace: dict[str, np.ndarray]) -> np.ndarray | None:
-    truth = np.column_stack([trace[f"truth_{name}"] for name in ("x_m", "y_m", "theta_rad")])
-    return truth if np.isfinite(truth).all() else None
-
-
-def _draw_map(
-    brain: NavigationBrain, plan: RunPlan, trace: dict[str, np.ndarray], path: Path
-) -> None:
-    links, truth = brain.map.links, _truth(trace)
-    figure = plot_map(
-        brain.map.poses,
-        np.column_stack([links.source, links.target]),
-        odometry_xy=odometry_track(brain.config, trace)[:, :2],
-        track_xy=trajectory(brain, trace)[:, :2],
-        truth_xy=None if truth is None else truth[:, :2],
-        current=brain.map.pose,
-        title=f"{'/'.join(Path(plan.source).parts[-2:])}: {len(trace['time_s'])} frames",
-    )
-    save(figure, path)
-
-
 def _absolute(source: str | Path) -> str:
     text = str(source)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise SourceError(f"{text!a}: its name is not UTF-8; rename it") from None
     return text if text.startswith("world:") else str(Path(text).resolve())
 
 
@@ -433,10 +334,9 @@ def _read_summary(out: Path) -> RunSummary:
     try:
         old = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
         return RunSummary(
-            frames=int(old["frames"]),
             seconds=float(old["seconds"]),
             cpu_seconds=float(old["cpu_seconds"]),
             skipped=list(old["skipped"]),
         )
     except (OSError, ValueError, KeyError, TypeError):
-        raise CheckpointError(f"{out}/metrics.json: missing or damaged; cannot resume") from None
+        raise RunError(f"{out}/metrics.json: missing or damaged; cannot resume") from None

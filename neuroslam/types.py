@@ -75,7 +75,7 @@ class ViewMatch(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """Centre of the dominant activity packet, in cells: ``[0, n_x)``, ``[0, n_y)``, ``[0, n_theta)``."""
+    """Centre of the dominant activity packet, in cells, each from 0 to the size of its axis."""
 
     x: float
     y: float

@@ -109,8 +109,24 @@ def test_a_frame_that_cannot_be_used_is_named_and_leaves_the_brain_as_it_was(fra
     with pytest.raises(BadFrame, match=message):
         brain(frame)
     for name, tensor in brain.state_dict().items():
-        assert torch.equal(tensor, before[name]), name
+        noted = name == "clock.after_gap_s"  # that there was a gap
+        assert noted or torch.equal(tensor, before[name]), name
     brain(Frame(4, 0.2, PICTURE, Velocity(0.5, 0.0)))  # and goes on
+
+
+def test_a_stream_goes_on_after_a_gap_and_after_one_wrong_time():
+    brain = seen()
+    for index, time_s in ((3, 60.0), (4, 0.2)):  # one wrong time: it is left out
+        frame = Frame(index, time_s, PICTURE, Velocity(0.5, 0.0))
+        if index == 3:
+            with pytest.raises(BadFrame, match="max_gap_s"):
+                brain(frame)
+        else:
+            assert brain(frame).motion.dt_s == pytest.approx(0.1)
+    with pytest.raises(BadFrame, match="max_gap_s"):
+        brain(Frame(5, 60.0, PICTURE, Velocity(0.5, 0.0)))
+    result = brain(Frame(6, 60.05, PICTURE, Velocity(0.5, 0.0)))  # time did pass
+    assert result.motion.dt_s == pytest.approx(0.05)
 
 
 def test_a_picture_of_another_size_is_named():

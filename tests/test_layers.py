@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 FLOW = [
     "errors", "types", "geometry", "config", "storage", "vision",
     "sensors", "odometry", "view", "cells", "mapping", "brain",
-    "evaluation", "plotting", "recording", "run_files", "runs", "demo", "experiments", "cli",
+    "evaluation", "drawing", "plotting", "recording", "run_files", "review", "runs", "demo",
+    "experiments", "cli",
 ]  # fmt: skip
 SIDE_BY_SIDE = {("odometry", "view"), ("view", "odometry")}
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
-from neuroslam import plotting
+from neuroslam import drawing, plotting
 from neuroslam.geometry import integrate_velocities
 from neuroslam.types import Pose, PoseEstimate
 
@@ -138,7 +138,7 @@ def test_drawing_leaves_pyplot_and_the_users_settings_alone():
 import sys, numpy as np, matplotlib
 names = ("font.size", "axes.grid", "font.family", "image.interpolation")
 before = [matplotlib.rcParams[name] for name in names]
-from neuroslam import plotting
+from neuroslam import drawing, plotting
 plotting.render(plotting.plot_map(np.zeros((2, 3)), np.array([[0, 1]])))
 print("matplotlib.pyplot" in sys.modules, before == [matplotlib.rcParams[name] for name in names])
 """
@@ -155,8 +155,8 @@ def segments(axes, colour):
 
 def test_a_link_between_neighbours_in_time_is_blue_and_any_other_is_a_loop_closure():
     axes = plotting.plot_map(SQUARE, RING).get_axes()[0]
-    assert len(segments(axes, plotting.MAP)) == 3
-    (loop,) = segments(axes, plotting.LOOP)
+    assert len(segments(axes, drawing.MAP)) == 3
+    (loop,) = segments(axes, drawing.LOOP)
     np.testing.assert_array_equal(loop, SQUARE[[3, 0], :2])
     assert axes.get_title("right") == "4 experiences · 4 links · 1 loop closure"
 
@@ -171,8 +171,8 @@ def test_the_counts_of_a_real_map_are_in_its_title(shared):
     left, right = plotting.plot_map(poses, links, odometry_xy=track[:, :2]).get_axes()
     assert left.get_title("right").startswith("2,873 frames · ")
     assert right.get_title("right") == "1,140 experiences · 1,418 links · 279 loop closures"
-    assert len(segments(right, plotting.LOOP)) == 279
-    assert len(segments(right, plotting.MAP)) == 1139
+    assert len(segments(right, drawing.LOOP)) == 279
+    assert len(segments(right, drawing.MAP)) == 1139
 
 
 def test_a_metre_is_as_long_upward_as_sideways():
@@ -195,7 +195,7 @@ def test_with_the_truth_known_the_map_is_laid_over_it_and_the_error_is_in_the_le
     truth = 2.0 * SQUARE[:, :2] @ np.array([[c, -s], [s, c]]).T + [10.0, -5.0]
     figure = plotting.plot_map(SQUARE, RING, truth_xy=truth, current=Pose(0.0, 1.0, 0.25))
     axes = figure.get_axes()[0]
-    drawn = np.concatenate(segments(axes, plotting.LOOP))
+    drawn = np.concatenate(segments(axes, drawing.LOOP))
     np.testing.assert_allclose(drawn, truth[[3, 0]], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
     assert "truth: ATE 0.0 cm, scale 2" in labels

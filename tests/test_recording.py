@@ -7,56 +7,31 @@ import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from neuroslam.cells.pose import PoseCellNetwork
+from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
-from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.recording import (
     NullRecorder,
     TensorBoardRecorder,
     activity_picture,
     frame_beside_template,
 )
-from neuroslam.types import Frame, Motion, StepResult, ViewMatch
+from neuroslam.types import Frame, Motion, StepResult, Velocity, ViewMatch
 
 N = 25
 
 
 def drive(recorder, n=N):
-    """A short drive of real cells and a real map; the view is a list of pictures."""
-    config = BrainConfig()
-    cells = config.pose_cells
-    templates = []
-    brain = SimpleNamespace(
-        view=SimpleNamespace(n=0, template_image=lambda i: templates[i]),
-        pose_cells=PoseCellNetwork(cells),
-        map=ExperienceMap(config.map, (cells.n_xy, cells.n_xy, cells.n_theta), 2.0),
-    )
+    """A short drive that sees a new place every third frame."""
+    brain = NavigationBrain(BrainConfig())
     results = []
     with recorder:
         for i in range(n):
-            image = np.random.default_rng(i // 3).integers(0, 255, (120, 160, 3), np.uint8)
-            motion = Motion(1.0, 0.1, 0.1)
-            view = ViewMatch(i // 3, 0.02 * (i % 3) if i else -1.0, 0.0, i % 3 == 0)
-            if view.is_new:
-                templates.append(cv2.resize(image[..., 0], (60, 10)))
-                brain.view.n += 1
-            estimate = brain.pose_cells(motion, view)
-            action, experience = brain.map(motion, view, estimate, i)
-            result = StepResult(
-                frame=i,
-                time_s=0.1 * i,
-                motion=motion,
-                view=view,
-                action=action,
-                experience=experience,
-                pose=brain.map.pose,
-                cells=estimate,
-                n_templates=brain.view.n,
-                n_experiences=brain.map.n,
-                n_links=brain.map.n_links,
-            )
-            recorder.step(result, Frame(i, 0.1 * i, image), brain)
+            coarse = np.random.default_rng(i // 3).integers(0, 255, (6, 8, 3), np.uint8)
+            image = cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_NEAREST)
+            frame = Frame(i, 0.1 * i, image, Velocity(1.0, 0.1))
+            result = brain(frame)
+            recorder.step(result, frame, brain)
             results.append((result, brain.pose_cells.peak, image))
     return results, brain
 

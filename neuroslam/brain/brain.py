@@ -54,7 +54,7 @@ class NavigationBrain(nn.Module):
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
         )
-        self.clock = Scalars(frame=-1, time_s=0.0, frames_seen=0)
+        self.clock = Scalars(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:
@@ -62,7 +62,8 @@ class NavigationBrain(nn.Module):
 
         Raises:
             BadFrame: If the frame's time does not follow the last one's, or it has nothing to
-                tell motion from. The brain is unchanged then and can go on with another frame.
+                tell motion from. The brain knows no more then than before, and can go on with
+                another frame; after a gap the one after next is taken, if it follows.
         """
         dt_s = self._elapsed(frame)
         v, w = self._velocity(frame, dt_s)
@@ -72,6 +73,7 @@ class NavigationBrain(nn.Module):
         action, experience = self.map(motion, view, cells, frame.index)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
+        self.clock.after_gap_s = -math.inf
         return StepResult(
             frame=frame.index,
             time_s=frame.time_s,
@@ -107,6 +109,10 @@ class NavigationBrain(nn.Module):
                 f"{self.clock.time_s:g} s of frame {self.clock.frame}; times must rise"
             )
         if dt_s > self.config.max_gap_s:
+            since_s = frame.time_s - self.clock.after_gap_s
+            if 0.0 < since_s <= self.config.max_gap_s:
+                return float(since_s)  # the gap is real: what was missed in it stays unknown
+            self.clock.after_gap_s = float(frame.time_s)
             raise BadFrame(
                 f"frame {frame.index}: {dt_s:g} s after frame {self.clock.frame}, more than "
                 f"max_gap_s = {self.config.max_gap_s:g}; raise it if the gap is real"

@@ -58,6 +58,8 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
         from neuroslam.sensors.world import open_world  # only who renders pays for its import
 
         return open_world(spec)
+    if spec == "":  # as a path it would be the working folder
+        raise SourceError(f"the source has an empty name; expected {_KINDS}")
     path = Path(spec)
     try:
         if not path.exists():

@@ -10,7 +10,6 @@ A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the
 
 import csv
 import io
-import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from neuroslam.types import Frame, Pose, Velocity
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
 _TRUTH = ("x_m", "y_m", "theta_rad")
+_FASTEST = 1e6  # m/s, rad/s: no robot's, but that of a damaged log, whose sums would overflow
 _EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), if you like time_s, and x_m,y_m,theta_rad"
 
 
@@ -102,13 +102,13 @@ class Track:
         """Return the motion over the interval that ends at that frame.
 
         Raises:
-            BadFrame: If it is not finite.
+            BadFrame: If it is not finite, or no robot's.
         """
         v, w = self.velocities[index].tolist()
-        if not (math.isfinite(v) and math.isfinite(w)):
+        if not (abs(v) <= _FASTEST and abs(w) <= _FASTEST):  # NaN too
             raise BadFrame(
                 f"{self.name}: frame {index} ({self.rows[index]}): its motion is v = {v} m/s, "
-                f"w = {w} rad/s; expected finite numbers"
+                f"w = {w} rad/s; expected finite numbers, at most {_FASTEST:g}"
             )
         return Velocity(v, w)
 

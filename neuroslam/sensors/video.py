@@ -95,8 +95,10 @@ class VideoSource(Source):
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:
+        # FFmpeg alone, where there is one: OpenCV's other readers print what they cannot read.
+        ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
         with quiet_opencv(), _quiet_ffmpeg():
-            capture = cv2.VideoCapture(self.name)
+            capture = cv2.VideoCapture(self.name, cv2.CAP_FFMPEG if ffmpeg else cv2.CAP_ANY)
         try:
             if not capture.isOpened():
                 raise SourceError(f"{self.name}: is not a video that can be read, or is truncated")

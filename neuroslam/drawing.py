@@ -1,0 +1,283 @@
+"""What figures are made of: colours, axes with a map, cells, a view or curves on them.
+
+One visual language: grey is odometry, blue the map, vermilion a loop closure, black dashes the
+truth; a circle is the start, a square the end, an arrow the robot now. The colours are those of
+M. Okabe and K. Ito's palette, which colour-blind readers can tell apart.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path as Outline
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.transforms import ScaledTranslation
+
+from neuroslam.errors import MapError
+from neuroslam.evaluation.trajectory import absolute_trajectory_error, align, path_length
+from neuroslam.mapping.experience import closes_loop
+from neuroslam.types import Pose, PoseEstimate
+
+ODOMETRY, MAP, LOOP, TRUTH = "#8c8c8c", "#0072B2", "#D55E00", "#000000"
+ROBOT, OTHER, INK, WALL = "#E69F00", "#009E73", "#222222", "#c9c9c9"
+CURVES = (MAP, LOOP, OTHER, "#CC79A7", "#E69F00", "#56B4E9")
+ACTIVITY = "viridis"
+
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#777777",
+    "axes.linewidth": 0.8,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "grid.color": "#ececec",
+    "grid.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "lines.solid_capstyle": "round",
+    "image.interpolation": "nearest",
+}
+_DART = Outline([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)])
+
+
+class _Placed(NamedTuple):
+    # The map, where the truth says it lies.
+    poses: np.ndarray
+    truth: np.ndarray | None
+    current: Pose | None
+    label: str
+
+
+def _place(
+    poses: np.ndarray,
+    track: np.ndarray | None,
+    truth: np.ndarray | None,
+    current: Pose | None,
+) -> _Placed:
+    if truth is None or not len(truth):
+        return _Placed(poses, None, current, "")
+    track = poses[:, :2] if track is None else np.asarray(track)
+    truth = np.asarray(truth)
+    if len(track) != len(truth):
+        raise ValueError(
+            f"plot_map: truth_xy has {len(truth)} points and the track {len(track)}; "
+            "give track_xy with a point for each of the truth"
+        )
+    try:
+        motion, mode = align(track, truth, "similarity"), "similarity"
+    except MapError:  # a robot that stood still: nothing to align, but there is still an error
+        motion, mode = align(track, truth, "none"), "none"
+    turn = math.atan2(motion.rotation[1, 0], motion.rotation[0, 0])
+    ate = absolute_trajectory_error(track, truth, mode).rmse
+    how = f"scale {motion.scale:.3g}" if mode == "similarity" else "not aligned"
+    moved = np.column_stack([motion.apply(poses[:, :2]), poses[:, 2] + turn])
+    if current is not None:
+        x, y = motion.apply(np.array([current[:2]]))[0]
+        current = Pose(float(x), float(y), current.theta_rad + turn)
+    return _Placed(moved, truth, current, f"truth: ATE {_metres(ate)}, {how}")
+
+
+def draw_odometry(axes: Axes, xy: np.ndarray) -> None:
+    """Draw a dead-reckoned track ``(k, 2)``."""
+    axes.plot(*xy.T, color=ODOMETRY, lw=1.1, label="odometry")
+    _draw_ends(axes, xy)
+    write_title(axes, "Odometry alone", f"{counted(len(xy), 'frame')} · {path_length(xy):,.1f} m")
+    _metric(axes)
+
+
+def draw_map(
+    axes: Axes,
+    poses: np.ndarray,
+    links: np.ndarray,
+    track: np.ndarray | None,
+    truth: np.ndarray | None,
+    walls: np.ndarray | None,
+    current: Pose | None,
+) -> None:
+    """Draw experiences, links, loop closures, truth and robot, where the truth puts them."""
+    poses, links = np.asarray(poses).reshape(-1, 3), np.asarray(links, np.int64).reshape(-1, 2)
+    poses, truth, current, truth_label = _place(poses, track, truth, current)
+    xy = poses[:, :2]
+    if walls is not None:
+        segments = np.asarray(walls).reshape(-1, 2, 2)
+        axes.add_collection(LineCollection(segments, colors=WALL, lw=2.5, zorder=1, label="walls"))
+    is_loop = closes_loop(links[:, 0], links[:, 1])
+    axes.add_collection(
+        LineCollection(xy[links[~is_loop]], colors=MAP, lw=0.9, alpha=0.8, zorder=2)
+    )
+    dot = float(np.clip(50.0 / math.sqrt(max(1, len(xy))), 2.0, 4.5))
+    axes.plot(*xy.T, ls="none", marker="o", ms=dot, mew=0, color=MAP, zorder=3)
+    axes.plot([], [], "-o", color=MAP, lw=0.9, ms=4, label="experiences, links")
+    if is_loop.any():
+        axes.add_collection(
+            LineCollection(xy[links[is_loop]], colors=LOOP, lw=1.3, zorder=4, label="loop closure")
+        )
+    if truth is not None:
+        axes.plot(*truth.T, "--", color=TRUTH, lw=0.9, zorder=5, label=truth_label)
+    _draw_ends(axes, xy, end=current is None)
+    if current is not None:
+        marker = MarkerStyle(_DART).rotated(rad=current.theta_rad)
+        style = {"ls": "none", "marker": marker, "ms": 13, "mfc": ROBOT, "mec": INK, "mew": 0.8}
+        axes.plot(*current[:2], zorder=8, label="robot now", **style)
+    axes.autoscale_view()
+    counts = ((len(xy), "experience"), (len(links), "link"), (int(is_loop.sum()), "loop closure"))
+    write_title(axes, "Experience map", " · ".join(counted(*count) for count in counts))
+    _metric(axes)
+
+
+def _draw_ends(axes: Axes, xy: np.ndarray, end: bool = True) -> None:
+    style = {"ls": "none", "mec": INK, "mew": 1.4, "zorder": 7}
+    if len(xy):
+        axes.plot(*xy[0], marker="o", ms=8, mfc="white", label="start", **style)
+    if len(xy) and end:
+        axes.plot(*xy[-1], marker="s", ms=6.5, mfc=INK, label="end", **style)
+
+
+def draw_pose_cells(
+    figure: Figure | SubFigure,
+    axes: Sequence[Axes],
+    activity: np.ndarray,
+    estimate: PoseEstimate | None,
+    injection: PoseEstimate | None,
+) -> None:
+    """Draw activity from above and from the side, with its colour bar."""
+    n_theta, n_y, n_x = activity.shape
+    step = 360.0 / n_theta
+    above, side = activity.sum(axis=0), activity.sum(axis=1)
+    top = max(float(above.max()), float(side.max())) or 1.0
+    for ax, layer, extent, vertical in (
+        (axes[0], above, (-0.5, n_x - 0.5, -0.5, n_y - 0.5), "y (cells)"),
+        (axes[1], side, (-0.5, n_x - 0.5, -step / 2, 360.0 - step / 2), "heading θ (°)"),
+    ):
+        picture = ax.imshow(
+            layer, ACTIVITY, origin="lower", extent=extent, aspect="auto", vmin=0.0, vmax=top
+        )
+        ax.set(xlabel="x (cells)", ylabel=vertical)
+        ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+        ax.grid(visible=False)
+        ax.set_box_aspect(n_y / n_x)
+    write_title(axes[0], "Place", "summed over θ")
+    write_title(axes[1], "Heading", "summed over y")
+    axes[1].set_yticks(range(0, 360, 90))
+    marks = ((injection, "o", "view injects here", 15), (estimate, "x", "estimate", 9))
+    for mark, marker, label, size in marks:
+        if mark is not None:
+            style = {"ls": "none", "marker": marker, "ms": size, "mew": 2.2, "mfc": "none"}
+            axes[0].plot(mark.x, mark.y, mec=LOOP, label=label, **style)
+            axes[1].plot(mark.x, mark.theta * step, mec=LOOP, **style)
+    if axes[0].get_legend_handles_labels()[0]:
+        legend_below(axes[0], columns=2)
+    bar = figure.colorbar(picture, cax=axes[1].inset_axes([1.04, 0.0, 0.045, 1.0]))
+    bar.set_label("share of all activity")
+    bar.outline.set_visible(False)
+
+
+def draw_frame(axes: Axes, image: np.ndarray) -> None:
+    """Draw a camera picture, grey or RGB."""
+    axes.imshow(as_rgb(image))
+    write_title(axes, "Frame", f"{image.shape[1]} by {image.shape[0]} px")
+    axes.set_axis_off()
+
+
+def draw_template(axes: Axes, template: np.ndarray, error: float, template_id: int) -> None:
+    """Draw a stored view, and how well it was matched."""
+    top = 255 if template.dtype == np.uint8 else 1.0
+    axes.imshow(template, "gray", vmin=0, vmax=top, interpolation="nearest")
+    said = f"match error {error:.3f}" if error >= 0 else "the first view"
+    write_title(axes, f"Template {template_id}", said)
+    axes.set_axis_off()
+
+
+def draw_signals(
+    axes: Sequence[Axes], frames: Mapping[str, np.ndarray], threshold: float | None
+) -> None:
+    """Draw match errors, and counts, over time."""
+    time = np.asarray(frames["time_s"], np.float64)
+    error = np.asarray(frames["match_error"], np.float64)
+    error = np.where(error < 0, np.nan, error)
+    is_new = np.zeros(len(error), bool) if threshold is None else error > threshold
+    size = float(np.clip(80.0 / math.sqrt(max(1, len(time))), 2.5, 6.0))
+    dots = {"ls": "none", "marker": ".", "ms": size, "mew": 0}
+    axes[0].plot(time[~is_new], error[~is_new], color=MAP, label="known view", **dots)
+    if threshold is not None:
+        axes[0].plot(time[is_new], error[is_new], color=LOOP, label="new view", **dots)
+        axes[0].axhline(threshold, color=INK, lw=0.9, ls="--", label=f"threshold {threshold:g}")
+    axes[0].set(ylabel="match error")
+    axes[0].set_ylim(bottom=0.0)
+    write_title(axes[0], "Recognition")
+    for name, colour in (("n_links", LOOP), ("n_experiences", MAP), ("n_templates", OTHER)):
+        counts = np.asarray(frames[name])
+        last = int(counts[-1]) if len(counts) else 0
+        axes[1].plot(time, counts, color=colour, lw=1.6, label=f"{last:,} {name[2:]}")
+    axes[1].set(xlabel="time (s)", ylabel="count")
+    axes[1].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes[1].set_ylim(bottom=0)
+    write_title(axes[1], "Memory")
+    for ax in axes:
+        ax.margins(x=0.01)
+        style = {"columnspacing": 0.9, "handletextpad": 0.4, "handlelength": 1.1, "fontsize": 8}
+        ax.legend(
+            loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=3, markerscale=8.0 / size, **style
+        )
+
+
+def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
+    """Make an empty figure that is drawn off screen."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=12, fontweight="bold")
+    return figure
+
+
+def _metric(axes: Axes) -> None:
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    seen = axes.dataLim.get_points() if axes.has_data() else np.zeros((2, 2))
+    seen = np.where(np.isfinite(seen), seen, 0.0)
+    if np.ptp(seen, axis=0).max() < 0.1:  # a point, or nothing, has no extent of its own
+        axes.update_datalim(seen.mean(axis=0) + np.array([[-0.05, -0.05], [0.05, 0.05]]))
+        axes.autoscale_view()
+    legend_below(axes, columns=4 if len(axes.get_legend_handles_labels()[0]) < 5 else 3)
+
+
+def write_title(axes: Axes, name: str, counts: str = "") -> None:
+    """Write what is seen at the left, and how much of it at the right."""
+    axes.set_title(name)
+    axes.set_title(counts, loc="right", fontsize=8, fontweight="normal")
+
+
+def legend_below(axes: Axes, columns: int) -> None:
+    """Put the legend outside the data."""
+    under = axes.transAxes + ScaledTranslation(0, -0.42, axes.figure.dpi_scale_trans)  # inches
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), bbox_transform=under, ncols=columns)
+
+
+def as_rgb(image: np.ndarray) -> np.ndarray:
+    """Give a grey picture three equal channels."""
+    image = np.asarray(image)
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+
+
+def counted(n: int, noun: str) -> str:
+    """Say how many, in the singular where it is one."""
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def _metres(distance: float) -> str:
+    return f"{100.0 * distance:.1f} cm" if distance < 1.0 else f"{distance:.2f} m"

@@ -1,0 +1,114 @@
+"""Looking back at a run: its errors against the truth, and its figures."""
+
+import warnings
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.errors import RunError
+from neuroslam.evaluation.trajectory import (
+    AlignmentMode,
+    ErrorStatistics,
+    absolute_trajectory_error,
+    associate,
+    read_tum,
+    relative_pose_error,
+)
+from neuroslam.plotting import plot_map, plot_pose_cells, plot_signals, save
+from neuroslam.run_files import (
+    RunPlan,
+    odometry_track,
+    read_frames,
+    read_plan,
+    read_trace,
+    trajectory,
+    true_poses,
+)
+
+
+def evaluate(
+    track: str | Path, truth: str | Path | None = None, align: AlignmentMode = "rigid"
+) -> list[tuple[str, ErrorStatistics, str]]:
+    """Compare a run, or any TUM file, with the true track.
+
+    Args:
+        track: Folder of a run, or a TUM file.
+        truth: TUM file; a run of a source that knows its truth needs none.
+        align: How the track is laid over the truth before it is compared.
+
+    Returns:
+        Name of the error, its statistics, its unit.
+
+    Raises:
+        NeuroslamError: If a file is missing or damaged, or there is no truth to compare with.
+    """
+    track = Path(track)
+    if align not in get_args(AlignmentMode):
+        raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
+    out = track if track.is_dir() else None
+    found = read_tum(track if out is None else out / "trajectory.tum")
+    if truth is not None:
+        true = read_tum(Path(truth))
+        i, j = associate(found.times_s, true.times_s)
+        estimate, reference = found.poses[i], true.poses[j]
+    else:
+        reference = None if out is None else true_poses(read_trace(out, len(found.times_s)))
+        if reference is None:
+            raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
+        estimate = found.poses
+    if len(estimate) < 2:
+        raise RunError(
+            f"{track}: {len(estimate)} of its frames have a true pose of their time; expected two"
+        )
+    relative = relative_pose_error(estimate, reference)
+    return [
+        (
+            "absolute (ATE)",
+            absolute_trajectory_error(estimate[:, :2], reference[:, :2], align),
+            "m",
+        ),
+        ("relative, a frame", relative.translation_m, "m"),
+        ("relative, a frame", relative.rotation_rad, "rad"),
+    ]
+
+
+def plot(out: str | Path, to: str | Path) -> list[Path]:
+    """Draw the figures of a run: map, pose cells at its end, recognition and counts over time.
+
+    Returns:
+        The files that were written.
+    """
+    out, to = Path(out), Path(to)
+    plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
+    rows, cells = brain.clock.frames_seen, brain.pose_cells
+    trace, frames = read_trace(out, rows), read_frames(out, rows)
+    try:
+        to.mkdir(parents=True, exist_ok=True)
+        draw_map(brain, plan, trace, to / "map.png")
+        save(plot_pose_cells(cells.activity.numpy(), cells.estimate), to / "pose_cells.png")
+        save(plot_signals(frames, brain.config.view.threshold), to / "signals.png")
+    except OSError as error:
+        raise RunError(f"{to}: cannot be written ({error.strerror or error})") from None
+    return [to / name for name in ("map.png", "pose_cells.png", "signals.png")]
+
+
+def draw_map(
+    brain: NavigationBrain, plan: RunPlan, trace: dict[str, np.ndarray], path: Path
+) -> None:
+    """Draw ``map.png`` of a run."""
+    links, truth = brain.map.links, true_poses(trace)
+    name = "/".join(Path(plan.source).parts[-2:]).replace("$", r"\$")  # a $ would begin a formula
+    figure = plot_map(
+        brain.map.poses,
+        np.column_stack([links.source, links.target]),
+        odometry_xy=odometry_track(brain.config, trace)[:, :2],
+        track_xy=trajectory(brain, trace)[:, :2],
+        truth_xy=None if truth is None else truth[:, :2],
+        current=brain.map.pose,
+        title=f"{name}: {len(trace['time_s'])} frames",
+    )
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a name in a script that the font lacks
+        save(figure, path)
