@@ -178,7 +178,7 @@ def presets_command() -> int:
 def experiment_command(
     name: Annotated[str, typer.Argument(metavar="NAME", help="corridor-loops or view-matching.")],
     out: Out,
-    data: Annotated[Path, typer.Option(help="Folder of the recordings.")] = Path("../shared/data"),
+    data: Annotated[Path, typer.Option(help="Folder that holds tuc_slam, rtabmap_corridor.")],
 ) -> int:
     """Repeat an experiment on real recordings."""
     from neuroslam.experiments import run_experiment
@@ -186,7 +186,8 @@ def experiment_command(
     rows = run_experiment(name, data, out)
     table = Table(*(key.replace("_", " ") for key in rows[0]), title=name)
     for row in rows:
-        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values())
+        table.add_row(*(cell.replace("_", " ") for cell in cells))
     console.print(table)
     console.print(f"Written: {out}")
     return 0

@@ -1,5 +1,6 @@
 """From a picture to a template: grey, crop, block mean, mean and patch normalisation."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -114,16 +115,24 @@ def normalise_patches(view: np.ndarray, radius: int, min_std: float) -> np.ndarr
         radius: Half width of a patch, px.
         min_std: Flatter patches become 0.5.
     """
-    size = (2 * radius + 1, 2 * radius + 1)
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-
-    count = total(np.ones_like(view))
-    middle = view.mean()  # deviations are of small differences: take them near zero
-    mean = total(view - middle) / count
-    variance = total((view - middle) ** 2) / count - mean**2
+    share = _patch_share(view.shape, radius)
+    apart = view - view.mean()  # deviations are small differences: take them near zero
+    mean = _patch_sums(apart, radius) * share
+    variance = _patch_sums(apart * apart, radius) * share - mean * mean
     std = np.sqrt(np.maximum(variance, 0.0))
     flat = std <= max(min_std, 1e-6)
-    z = (view - middle - mean) / np.where(flat, 1.0, std)
-    return np.where(flat, 0.5, np.clip((z + 3.0) / 6.0, 0.0, 1.0))
+    std[flat] = 1.0
+    found = np.clip((apart - mean) / (6.0 * std) + 0.5, 0.0, 1.0)
+    found[flat] = 0.5
+    return found
+
+
+def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:
+    size = (2 * radius + 1, 2 * radius + 1)
+    return cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+
+@lru_cache(maxsize=8)
+def _patch_share(shape: tuple[int, int], radius: int) -> np.ndarray:
+    """One over the number of pixels of each patch that lie in the view."""
+    return 1.0 / _patch_sums(np.ones(shape), radius)
