@@ -440,7 +440,8 @@ def test_a_folder_for_figures_that_cannot_be_made_is_named(finished, tmp_path, m
 
 
 def test_experiments_without_their_data_or_of_no_known_name_are_refused(tmp_path, mistake):
-    assert "corridor-loops" in mistake("experiment", "corridr-loops", "-o", tmp_path / "out")
+    given = ("-o", tmp_path / "out", "--data", tmp_path)
+    assert "corridor-loops" in mistake("experiment", "corridr-loops", *given)
     assert "nowhere" in mistake(
         "experiment", "corridor-loops", "-o", tmp_path / "out", "--data", tmp_path / "nowhere"
     )
