@@ -354,13 +354,17 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         return BrainConfig.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        where = ".".join(part for part in first["loc"] if isinstance(part, str))
         if first["type"] == "extra_forbidden":
             raise ConfigError(
                 f"{origin}: unknown key {where!r}{_did_you_mean(where, _all_keys())}"
             ) from None
         said = first["msg"].removeprefix("Value error, ")
         said = said[0].lower() + said[1:]
+        if first["type"] == "model_type":
+            said = f"is a section; set one of its keys, as {where}.KEY"
+        elif isinstance(first["loc"][-1], int):
+            said = "expected four whole numbers x_min, x_max, y_min, y_max"
         raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
 
 

@@ -47,6 +47,9 @@ def test_the_presets_the_data_need_are_there():
         ({"map": {"correction": 0.7}}, r"map.correction = 0.7"),
         ({"map": {"correction": float("nan")}}, r"map.correction"),
         ({"odometry": {"fov_deg": float("inf")}}, r"odometry.fov_deg"),
+        ({"view": 3}, r"view = 3: is a section; set one of its keys, as view\.KEY"),
+        ({"view": {"crop": [0, 1, 2]}}, r"view\.crop = .*expected four whole numbers x_min"),
+        ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
         ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
     ],
 )
