@@ -62,7 +62,8 @@ class ViewMatch(NamedTuple):
     Attributes:
         template: Id of the template, or ``NO_TEMPLATE`` if the frame shows nothing to recognise.
         error: Smallest mean absolute difference to a stored template (grey levels in [0, 1]);
-            -1 where there was nothing to compare with.
+            -1 where there was nothing to compare with. Of a new view among thousands it is that of
+            a near template, above the threshold, not surely the nearest.
         relative_heading_rad: Heading now minus heading when the template was learnt (panoramic
             views), in (-pi, pi]; 0 for forward views.
         is_new: The template was created from this very frame.

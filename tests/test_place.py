@@ -14,6 +14,7 @@ from neuroslam.evaluation.place import (
     recall_at_full_precision,
 )
 from neuroslam.experiments import run_experiment, view_matching
+from neuroslam.view import LocalViewCells
 
 
 def test_a_hand_worked_curve():
@@ -62,13 +63,18 @@ def test_a_corridor_walked_twice(shared, tmp_path):
 
 
 def test_the_experiment_is_that_of_the_view_cells():
-    """Distances are symmetric at shift 0, zero to itself, and those of a search."""
+    """Distances are symmetric at shift 0, zero to itself, and those of a search at any."""
     images = [np.random.default_rng(i).integers(0, 256, (48, 64), np.uint8) for i in range(4)]
     config = view_matching.ViewConfig(template_width=16, template_height=12, shift_match=0)
     found = view_matching.distance_matrix(images, config)
     np.testing.assert_array_equal(found, found.T)
     assert np.diag(found).max() == 0.0
     assert found[0, 1] > 0.05
+    config = view_matching.ViewConfig(template_width=16, template_height=12, shift_match=3)
+    shifted = view_matching.distance_matrix(images, config)
+    cells = LocalViewCells(config)
+    cells.learn(cells.encode(images[1]))
+    assert shifted[0, 1] == cells.search(cells.encode(images[0])).error
 
 
 def test_a_missing_truth_is_named(tmp_path):

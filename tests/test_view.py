@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.config import PoseCellConfig, ViewConfig
-from neuroslam.errors import ConfigError
+from neuroslam.errors import BadFrame, ConfigError, MapError
 from neuroslam.view import LocalViewCells
 from neuroslam.view.preprocess import block_mean, encode, normalise_mean, normalise_patches
 
@@ -190,3 +190,39 @@ def test_the_gate_skips_templates_of_another_mean(precision):
     assert brighter.is_new
     assert brighter.error == -1.0  # nothing passed the gate, so nothing was compared
     assert cells(view + 2).template == 0
+
+
+@pytest.mark.parametrize(
+    ("image", "got"),
+    [
+        (picture() / 255.0, r"float64 \(64, 96\)"),
+        (picture().astype(np.uint16), r"uint16 \(64, 96\)"),
+        (np.stack([picture()] * 4, axis=2), r"uint8 \(64, 96, 4\)"),
+        (np.stack([picture()] * 3), r"uint8 \(3, 64, 96\)"),
+        (picture()[..., None], r"uint8 \(64, 96, 1\)"),
+    ],
+    ids=["float", "16 bit", "with alpha", "channels first", "one channel"],
+)
+def test_a_picture_of_another_kind_is_refused_and_not_taken_for_black(image, got):
+    cells = LocalViewCells(ViewConfig(**SMALL))
+    with pytest.raises(BadFrame, match=rf"picture is {got}; expected uint8, \(h, w\) or"):
+        cells(image)
+    assert cells.n == 0
+
+
+def test_a_view_of_another_size_is_neither_compared_nor_stored():
+    cells = LocalViewCells(ViewConfig(**SMALL))
+    view = cells.encode(picture())
+    cells.learn(view)
+    for wrong in (view.T, view[:, 1:]):
+        for use in (cells.learn, cells.search):
+            with pytest.raises(MapError, match=r"expected \(template_height, .* = \(8, 24\)"):
+                use(wrong)
+
+
+@pytest.mark.parametrize("template", [-1, 1])
+def test_a_template_that_is_not_there_cannot_be_looked_at(template):
+    cells = LocalViewCells(ViewConfig(**SMALL))
+    cells(picture())
+    with pytest.raises(MapError, match=f"no template {template}; there are 1"):
+        cells.template_image(template)

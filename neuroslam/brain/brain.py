@@ -66,9 +66,11 @@ class NavigationBrain(nn.Module):
                 another frame; after a gap the one after next is taken, if it follows.
         """
         dt_s = self._elapsed(frame)
-        v, w = self._velocity(frame, dt_s)
-        motion = Motion(v, w, dt_s)
-        view = BLIND if frame.image is None else self.view(frame.image)
+        try:
+            motion = Motion(*self._velocity(frame, dt_s), dt_s)
+            view = BLIND if frame.image is None else self.view(frame.image)
+        except BadFrame as fault:
+            raise BadFrame(f"frame {frame.index}: {fault}") from None
         cells = self.pose_cells(motion, view)
         action, experience = self.map(motion, view, cells, frame.index)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
@@ -123,17 +125,12 @@ class NavigationBrain(nn.Module):
         use = self.config.odometry.use
         if use != "visual" and frame.velocity is not None:
             if not all(map(math.isfinite, frame.velocity)):
-                raise BadFrame(
-                    f"frame {frame.index}: odometry v = {frame.velocity[0]:g} m/s, "
-                    f"w = {frame.velocity[1]:g} rad/s; expected finite numbers"
-                )
+                v, w = frame.velocity
+                raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
             return Velocity(*map(float, frame.velocity))
         if use == "given" or frame.image is None:
             raise BadFrame(
-                f"frame {frame.index}: no odometry in the source"
+                "no odometry in the source"
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
-        try:
-            return self.odometry(frame.image, dt_s)
-        except BadFrame as fault:
-            raise BadFrame(f"frame {frame.index}: {fault}") from None
+        return self.odometry(frame.image, dt_s)

@@ -1,7 +1,7 @@
 """Recognising places of a corridor walked twice: which template tells them apart best?
 
 The recording is 84 photographs and a matrix that marks, below its diagonal, the pairs that show one
-place: those 38 to 42 photographs apart, and at the end 79 to 82. Photographs next to each other are
+place: those 38 to 42 photographs apart, and at the end 79 to 81. Photographs next to each other are
 not marked although they look alike, so pairs fewer than 20 apart count neither way.
 """
 
@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import matplotlib as mpl
 import numpy as np
 
 from neuroslam.config import ViewConfig
+from neuroslam.drawing import STYLE, write_title
 from neuroslam.errors import SourceError
 from neuroslam.evaluation.place import (
     PrecisionRecall,
@@ -24,6 +26,8 @@ from neuroslam.plotting import plot_precision_recall, save
 from neuroslam.sensors import open_source
 from neuroslam.storage import write_atomically
 from neuroslam.view import LocalViewCells
+from neuroslam.view.search import distances as sums_of_differences
+from neuroslam.view.templates import to_bytes
 
 APART = 20
 """Photographs nearer in time than this are no question."""
@@ -77,12 +81,16 @@ def view_matching(data_folder: Path, out_folder: Path) -> dict[str, Any]:
             )
             if (width, height, shift) == SIZES[0]:
                 precision = average_precision(nearest)
-                curves[f"{name}, AP {precision:.2f}"] = (nearest.precision, nearest.recall)
+                curves[f"{name} {precision:.2f}"] = (nearest.precision, nearest.recall)
     result = {"rows": rows, "photographs": len(images), "true_pairs": int(truth.sum())}
     out = Path(out_folder)
     text = json.dumps(result, indent=2) + "\n"
     write_atomically(out / "results.json", lambda file: file.write_text(text, encoding="utf-8"))
-    save(plot_precision_recall(curves), out / "pr_curves.png")
+    figure = plot_precision_recall(curves)
+    size = f"{SIZES[0][0]}x{SIZES[0][1]} px"
+    with mpl.rc_context(STYLE):
+        write_title(figure.axes[0], "Is the nearest view this place?", f"average precision; {size}")
+    save(figure, out / "pr_curves.png")
     return result
 
 
@@ -101,14 +109,15 @@ def read_truth(path: Path, n: int) -> np.ndarray:
 
 def distance_matrix(images: list[np.ndarray], config: ViewConfig) -> np.ndarray:
     """Compare every picture with every other as the view cells do: ``(n, n)``, grey in [0, 1]."""
-    views = [LocalViewCells(config).encode(image) for image in images]
-    found = np.zeros((len(views), len(views)))
-    for j, view in enumerate(views):
-        cells = LocalViewCells(config)
+    cells = LocalViewCells(config)
+    views = [cells.encode(image) for image in images]
+    for view in views:
         cells.learn(view)
-        for i, other in enumerate(views):
-            found[i, j] = cells.search(other).error
-    return found
+    pixels, geometry = cells.templates["pixels"].numpy(), cells.geometry
+    nearest = [
+        sums_of_differences(pixels, to_bytes(view.T), geometry).min(axis=0) for view in views
+    ]
+    return np.array(nearest) / (255.0 * geometry.n_pixels)
 
 
 def _asked(n: int) -> np.ndarray:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from neuroslam.config import ViewConfig
-from neuroslam.errors import ConfigError
+from neuroslam.errors import BadFrame, ConfigError
 
 
 class Encoded(NamedTuple):
@@ -30,6 +30,7 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         config: Crop, size and normalisations.
 
     Raises:
+        BadFrame: If the picture is of another type or shape.
         ConfigError: If the crop leaves the picture, or is smaller than the template.
 
     Example:
@@ -40,8 +41,13 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         >>> (encode(picture, config).template[0] * 255).tolist()
         [4.5, 6.5, 8.5, 10.5]
     """
-    if image.ndim == 3:
+    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise BadFrame(
+            f"LocalViewCells: picture is {image.dtype} {image.shape}; "
+            "expected uint8, (h, w) or (h, w, 3)"
+        )
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
     contrast = float(view.std()) if config.min_contrast else 1.0
     if config.normalisation:

@@ -5,6 +5,7 @@ import torch
 from torch import nn
 
 from neuroslam.config import ViewConfig
+from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
@@ -73,12 +74,19 @@ class LocalViewCells(nn.Module):
         """Make the template of a picture: grey in [0, 1], ``(template_height, template_width)``.
 
         Raises:
+            BadFrame: If the picture is not ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
             ConfigError: If crop and template do not fit the picture.
         """
         return encode(image, self.config).template
 
     def template_image(self, template: int) -> np.ndarray:
-        """Return a template as a grey picture, ``uint8``, ``(template_height, template_width)``."""
+        """Return a template as a grey picture, ``uint8``, ``(template_height, template_width)``.
+
+        Raises:
+            MapError: If there is no such template.
+        """
+        if not 0 <= template < self.n:
+            raise MapError(f"LocalViewCells: no template {template}; there are {self.n}, from 0")
         pixels = self.templates["pixels"][template].numpy(force=True)
         return pixels.reshape(self.config.template_width, self.config.template_height).T.copy()
 
@@ -92,7 +100,11 @@ class LocalViewCells(nn.Module):
 
         Returns:
             The template and its distance; ``NO_TEMPLATE`` and -1 if there is none to compare with.
+
+        Raises:
+            MapError: If the view is not of the templates' size.
         """
+        self._check(view)
         query = to_bytes(view.T)
         if self._exact or self.config.mean_gate:
             found, error = self._search_values(np.ascontiguousarray(view.T), query)
@@ -103,7 +115,7 @@ class LocalViewCells(nn.Module):
                 self.templates["blocks"].numpy(force=True),
                 query,
                 self.geometry,
-                limit * scale,
+                limit * scale + 0.5,  # sums are integers: rounding loses none at the limit
                 (self.last.template, self.last.template + 1),
             )
             error = found.distance / scale
@@ -118,9 +130,11 @@ class LocalViewCells(nn.Module):
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
 
         Returns:
-            The match; ``NO_TEMPLATE`` if the picture has too little contrast to show anything.
+            The match; ``NO_TEMPLATE`` if the picture has too little contrast to show anything. The
+            error of a new view among thousands is that of a near template, not surely the nearest.
 
         Raises:
+            BadFrame: If the picture is of another type or shape.
             ConfigError: If crop and template do not fit the picture.
         """
         view, contrast = encode(image, self.config)
@@ -133,7 +147,12 @@ class LocalViewCells(nn.Module):
         return match
 
     def learn(self, view: np.ndarray) -> int:
-        """Store a view, as :meth:`encode` makes it, whatever it is like; returns its id."""
+        """Store a view, as :meth:`encode` makes it, whatever it is like; returns its id.
+
+        Raises:
+            MapError: If the view is not of the templates' size.
+        """
+        self._check(view)
         columns = np.ascontiguousarray(view.T)
         pixels = to_bytes(columns)
         row = {
@@ -145,6 +164,14 @@ class LocalViewCells(nn.Module):
         if self.config.mean_gate:
             row["mean"] = view.mean() if self._exact else pixels.mean() / 255.0
         return self.templates.append(**row)
+
+    def _check(self, view: np.ndarray) -> None:
+        size = (self.geometry.height, self.geometry.width)
+        if view.shape != size:
+            raise MapError(
+                f"LocalViewCells: view is {view.shape}; expected (template_height, template_width) "
+                f"= {size}, as encode makes it"
+            )
 
     def _search_values(self, view: np.ndarray, query: np.ndarray) -> tuple[Nearest, float]:
         """Search in full precision: bytes tell which templates and shifts can be the nearest.
