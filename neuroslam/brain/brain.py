@@ -65,8 +65,8 @@ class NavigationBrain(nn.Module):
                 tell motion from. The brain knows no more then than before, and can go on with
                 another frame; after a gap the one after next is taken, if it follows.
         """
-        dt_s = self._elapsed(frame)
         try:
+            dt_s = self._elapsed(frame)
             motion = Motion(*self._velocity(frame, dt_s), dt_s)
             view = BLIND if frame.image is None else self.view(frame.image)
         except BadFrame as fault:
@@ -107,8 +107,7 @@ class NavigationBrain(nn.Module):
         dt_s = frame.time_s - self.clock.time_s
         if not dt_s > 0.0:  # NaN too
             raise BadFrame(
-                f"frame {frame.index}: time {frame.time_s:g} s does not follow "
-                f"{self.clock.time_s:g} s of frame {self.clock.frame}; times must rise"
+                f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s of frame {self.clock.frame}; times must rise"
             )
         if dt_s > self.config.max_gap_s:
             since_s = frame.time_s - self.clock.after_gap_s
@@ -116,7 +115,7 @@ class NavigationBrain(nn.Module):
                 return float(since_s)  # the gap is real: what was missed in it stays unknown
             self.clock.after_gap_s = float(frame.time_s)
             raise BadFrame(
-                f"frame {frame.index}: {dt_s:g} s after frame {self.clock.frame}, more than "
+                f"{dt_s:g} s after frame {self.clock.frame}, more than "
                 f"max_gap_s = {self.config.max_gap_s:g}; raise it if the gap is real"
             )
         return float(dt_s)
