@@ -31,7 +31,7 @@ format: $(VENV)/.installed
 
 # Notebooks are kept as text: the .py is the source, the .ipynb is made from it.
 notebooks: $(VENV)/.installed
-	$(BIN)/jupytext --to notebook notebooks/*.py
+	$(BIN)/jupytext --update --to notebook notebooks/*.py
 
 clean:
 	rm -rf $(VENV) demo out .pytest_cache .ruff_cache .hypothesis
