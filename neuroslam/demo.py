@@ -20,7 +20,7 @@ from neuroslam.runs import resume, run
 from neuroslam.sensors import open_source
 from neuroslam.types import StepResult
 
-WORLD = "world:corridor?laps=2&noise=0.05"
+WORLD = "world:corridor?laps=2&noise=0.05&light=0.3&people=4"
 
 
 def demo(

@@ -82,7 +82,7 @@ def _place(
         motion, mode = align(track, truth, "none"), "none"
     turn = math.atan2(motion.rotation[1, 0], motion.rotation[0, 0])
     ate = absolute_trajectory_error(track, truth, mode).rmse
-    how = f"scale {motion.scale:.3g}" if mode == "similarity" else "not aligned"
+    how = f"map scaled by {motion.scale:.3g}" if mode == "similarity" else "not aligned"
     moved = np.column_stack([motion.apply(poses[:, :2]), poses[:, 2] + turn])
     if current is not None:
         x, y = motion.apply(np.array([current[:2]]))[0]

@@ -198,7 +198,7 @@ def test_with_the_truth_known_the_map_is_laid_over_it_and_the_error_is_in_the_le
     drawn = np.concatenate(segments(axes, drawing.LOOP))
     np.testing.assert_allclose(drawn, truth[[3, 0]], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
-    assert "truth: ATE 0.0 cm, scale 2" in labels
+    assert "truth: ATE 0.0 cm, map scaled by 2" in labels
     robot = labels["robot now"]
     np.testing.assert_allclose(robot.get_xydata()[0], truth[3], atol=1e-9)
     tip = robot._marker.get_transform().transform((1.0, 0.0))
