@@ -107,7 +107,8 @@ class NavigationBrain(nn.Module):
         dt_s = frame.time_s - self.clock.time_s
         if not dt_s > 0.0:  # NaN too
             raise BadFrame(
-                f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s of frame {self.clock.frame}; times must rise"
+                f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s "
+                f"of frame {self.clock.frame}; times must rise"
             )
         if dt_s > self.config.max_gap_s:
             since_s = frame.time_s - self.clock.after_gap_s
