@@ -1,5 +1,6 @@
 """Local view cells: what becomes a template, what is recognised, what shows nothing."""
 
+import csv
 import math
 
 import cv2
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.config import PoseCellConfig, ViewConfig
 from neuroslam.errors import BadFrame, ConfigError, MapError
+from neuroslam.runs import resolve_config
+from neuroslam.sensors import open_source
 from neuroslam.view import LocalViewCells
 from neuroslam.view.preprocess import block_mean, encode, normalise_mean, normalise_patches
 
@@ -34,6 +37,20 @@ def test_a_place_is_learnt_once_and_recognised_after():
     assert not any(m.is_new for m in again)
     assert all(m.error == 0.0 for m in again)
     assert cells.n == 10
+
+
+@pytest.mark.parametrize("name", ["circuit_launch", "usi_track1"])
+def test_a_real_drive_is_told_apart_as_by_the_reference(shared, name):
+    """Of C++ OpenRatSLAM on the same frames, every id is equal and every error."""
+    refs = shared / "refs" / "ratslam"
+    cells = LocalViewCells(resolve_config("openratslam", refs / f"config_{name}.ini").view)
+    frames = open_source(shared / "data" / name / "frames.tar").frames()
+    found = [cells(frame.image) for frame in frames]
+    with (refs / f"{name}_sync_frames.csv").open() as file:
+        wanted = list(csv.DictReader(file))
+    assert [match.template for match in found] == [int(row["vt_id"]) for row in wanted]
+    errors = [float(row["vt_error"]) for row in wanted]
+    np.testing.assert_allclose([match.error for match in found], errors, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["uint8", "float64"])

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
 from neuroslam.config import ViewConfig
 from neuroslam.sensors import open_source
@@ -21,22 +22,36 @@ def memory(templates, **config):
     return cells
 
 
-def brute_force(templates, view, config):
-    """The definition, in float64: id and error of the nearest."""
-    width, s = view.shape[1], config.shift_match
-    if config.panoramic:
-        each = [
-            np.abs(templates - np.roll(view, o, axis=1)).mean(axis=(1, 2))
-            for o in range(0, width, config.shift_step)
-        ]
-    else:
-        query = view[:, s : width - s]
-        each = [
-            np.abs(templates[:, :, o : o + width - 2 * s] - query).mean(axis=(1, 2))
-            for o in range(0, 2 * s + 1, config.shift_step)
-        ]
-    errors = np.min(each, axis=0)
-    return int(errors.argmin()), float(errors.min())
+def brute_force(templates, views, config):
+    """The definition, in float64: distance of every view to every template, best of all shifts."""
+    width, step, s = views.shape[2], config.shift_step, config.shift_match
+    best = np.inf
+    for o in range(0, width if config.panoramic else 2 * s + 1, step):
+        if config.panoramic:
+            there, here = templates, np.roll(views, o, axis=2)
+        else:
+            there, here = templates[:, :, o : o + width - 2 * s], views[:, :, s : width - s]
+        flat = [part.reshape(len(part), -1) for part in (here, there)]
+        best = np.minimum(best, cdist(*flat, "cityblock") / flat[0].shape[1])
+    return best
+
+
+def assert_exact(cells, views):
+    """Every search gives the template and the error of brute force; returns these errors."""
+    seen = np.stack([quantised(view, cells) for view in views])
+    wanted = brute_force(stored(cells), seen, cells.config)
+    for view, errors in zip(views, wanted, strict=True):
+        found = cells.search(view)
+        assert found.template == errors.argmin()
+        assert found.error == pytest.approx(errors.min(), abs=1e-12)
+    return wanted.min(axis=1)
+
+
+@pytest.fixture
+def always_pruned(monkeypatch):
+    """Small memories are searched as large ones: by bounds, and in parts."""
+    monkeypatch.setattr(search, "PRUNE_FROM", 100)
+    monkeypatch.setattr(search, "_AT_ONCE", 64)
 
 
 def stored(cells):
@@ -64,72 +79,90 @@ def smooth(rng, n, height=10, width=60):
     return top * (1 - a) + (corner(1, 0) * (1 - b) + corner(1, 1) * b) * a
 
 
+def noise(rng, n):
+    return rng.random((n, 10, 60))
+
+
+@pytest.mark.usefixtures("always_pruned")
 @pytest.mark.parametrize("precision", ["uint8", "float64"])
-@pytest.mark.parametrize("kind", ["smooth", "noise"])
-def test_a_thousand_random_queries_find_what_brute_force_finds(monkeypatch, precision, kind):
-    monkeypatch.setattr(search, "PRUNE_FROM", 200)
+@pytest.mark.parametrize("make", [smooth, noise])
+def test_a_thousand_random_queries_find_what_brute_force_finds(precision, make):
     rng = np.random.default_rng(7)
-    make = smooth if kind == "smooth" else lambda rng, n: rng.random((n, 10, 60))
     cells = memory(make(rng, 400), shift_match=5, precision=precision)
-    templates = stored(cells)
-    for number in range(500):
-        view = make(rng, 1)[0]
-        if number % 2:  # half of them are seen again, shifted and in another light
-            view = np.roll(templates[rng.integers(400)], rng.integers(-5, 6), axis=1)
-            view = np.clip(view + rng.normal(0, 0.02, view.shape), 0, 1)
-        found = cells.search(view)
-        wanted, error = brute_force(templates, quantised(view, cells), cells.config)
-        assert found.template == wanted
-        assert found.error == pytest.approx(error, abs=1e-12)
+    views = make(rng, 1000)
+    for view in views[::2]:  # half of them are seen again, shifted and noisy
+        view[:] = np.roll(stored(cells)[rng.integers(400)], rng.integers(-5, 6), axis=1)
+        view[:] = np.clip(view + rng.normal(0, 0.02, view.shape), 0, 1)
+    assert_exact(cells, views)
 
 
+@pytest.mark.usefixtures("always_pruned")
 @pytest.mark.parametrize("precision", ["uint8", "float64"])
-def test_a_thousand_real_queries_find_what_brute_force_finds(shared, monkeypatch, precision):
-    monkeypatch.setattr(search, "PRUNE_FROM", 200)
+def test_a_thousand_real_queries_find_what_brute_force_finds(shared, precision):
     config = {"crop": (0, 160, 0, 60), "template_width": 40, "template_height": 15}
     cells = LocalViewCells(ViewConfig(**config, precision=precision))
     source = open_source(shared / "data" / "usi_track1" / "frames.tar")
     views = [cells.encode(frame.image) for frame in source.frames(0, 1400)]
     for view in views[:400]:
         cells.learn(view)
-    templates = stored(cells)
-    for view in views[400:]:
-        found = cells.search(view)
-        wanted, error = brute_force(templates, quantised(view, cells), cells.config)
-        assert found.template == wanted
-        assert found.error == pytest.approx(error, abs=1e-12)
+    assert_exact(cells, views[400:])
+
+
+@pytest.mark.usefixtures("always_pruned")
+@pytest.mark.parametrize("precision", ["uint8", "float64"])
+def test_a_panorama_finds_what_brute_force_finds(precision):
+    rng = np.random.default_rng(3)
+    cells = memory(smooth(rng, 300), panoramic=True, shift_step=2, precision=precision)
+    picked = stored(cells)[rng.integers(300, size=60)]
+    views = [np.roll(view, rng.integers(60), axis=1) for view in picked]
+    assert_exact(cells, [np.clip(view + rng.normal(0, 0.02, view.shape), 0, 1) for view in views])
 
 
 @pytest.mark.parametrize("precision", ["uint8", "float64"])
-def test_a_panorama_finds_what_brute_force_finds(monkeypatch, precision):
-    monkeypatch.setattr(search, "PRUNE_FROM", 100)
-    rng = np.random.default_rng(3)
-    cells = memory(smooth(rng, 300), panoramic=True, shift_step=2, precision=precision)
-    templates = stored(cells)
-    for _ in range(60):
-        view = np.roll(templates[rng.integers(300)], rng.integers(60), axis=1)
-        view = np.clip(view + rng.normal(0, 0.02, view.shape), 0, 1)
+def test_behind_the_gate_the_search_is_that_of_what_passed_it(precision):
+    rng = np.random.default_rng(11)
+    templates = smooth(rng, 60) * rng.uniform(0.3, 1.0, (60, 1, 1))
+    cells = memory(templates, shift_match=5, precision=precision, mean_gate=True, threshold=0.1)
+    views = np.clip(templates + rng.normal(0, 0.05, (60, 10, 60)), 0, 1)
+    seen = np.stack([quantised(view, cells) for view in views])
+    errors = brute_force(stored(cells), seen, cells.config)
+    passed = np.abs(stored(cells).mean((1, 2)) - seen.mean((1, 2))[:, None]) <= 0.105
+    assert 0.2 < passed.mean() < 0.8
+    for view, wanted in zip(views, np.where(passed, errors, np.inf), strict=True):
         found = cells.search(view)
-        wanted, error = brute_force(templates, quantised(view, cells), cells.config)
-        assert (found.template, found.error) == (wanted, pytest.approx(error, abs=1e-12))
+        assert found.template == wanted.argmin()
+        assert found.error == pytest.approx(wanted.min(), abs=1e-12)
 
 
-def test_with_a_limit_the_search_is_exact_up_to_it(monkeypatch):
-    monkeypatch.setattr(search, "PRUNE_FROM", 100)
+@pytest.mark.usefixtures("always_pruned")
+@pytest.mark.parametrize(("make", "limit"), [(smooth, 0.05), (noise, 0.295)])
+def test_with_a_limit_the_search_is_exact_up_to_it(make, limit):
     rng = np.random.default_rng(5)
-    cells = memory(smooth(rng, 500), shift_match=5)
-    templates = stored(cells)
-    within = 0
-    for number in range(200):
-        view = np.clip(templates[number] + rng.normal(0, 0.03 * (number % 5), (10, 60)), 0, 1)
-        found = cells.search(view, limit=0.05)
-        wanted, error = brute_force(templates, quantised(view, cells), cells.config)
-        if error <= 0.05:
-            within += 1
-            assert (found.template, found.error) == (wanted, pytest.approx(error))
+    cells = memory(make(rng, 500), shift_match=5)
+    apart = rng.normal(0, 0.03, (200, 10, 60)) * (np.arange(200) % 5)[:, None, None]
+    views = np.concatenate([np.clip(stored(cells)[:200] + apart, 0, 1), make(rng, 100)])
+    errors = assert_exact(cells, views)
+    assert 20 < (errors <= limit).sum() < 280
+    for view, error in zip(views, errors, strict=True):
+        limited = cells.search(view, limit)
+        if error <= limit:
+            assert limited == cells.search(view)
         else:
-            assert found.error >= error - 1e-12  # never better than the truth
-    assert 20 < within < 180
+            assert limited.error >= error - 1e-12  # never better than the truth
+
+
+def test_templates_that_differ_by_less_than_a_byte_are_told_apart():
+    """More than a list of the nearest holds; those like the view before the gate do not count."""
+    base = smooth(np.random.default_rng(4), 1)[0] * 0.5 + 0.2
+    like = base + 1e-8 * np.arange(40)[:, None, None]
+    gated = base.copy()
+    gated[:, :5] = gated[:, -5:] = 0.0  # equal where it is compared, but darker
+    templates = np.concatenate([np.repeat(gated[None], 30, axis=0), like])
+    config = {"shift_match": 5, "precision": "float64", "threshold": 0.01}
+    cells = memory(templates, **config, mean_gate=True)
+    assert [cells.search(view).template for view in like] == list(range(30, 70))
+    assert memory(templates, **config).search(like[35]).template == 65
+    assert cells.search(gated).template == 0
 
 
 @given(seed=st.integers(0, 10_000), shift=st.integers(0, 6), panoramic=st.booleans())

@@ -23,6 +23,8 @@ PRUNE_FROM = 3000
 
 _PROBES = 32
 _MAX_BLOCKS = 64
+_LISTED = 16
+_AT_ONCE = 4096  # templates whose pixels stay in the cache over all shifts
 
 
 class Nearest(NamedTuple):
@@ -82,6 +84,11 @@ class Geometry(NamedTuple):
         block_w, block_h = self.block
         return (self.core[1] - self.core[0]) // block_w * (self.height // block_h) if block_w else 0
 
+    @property
+    def n_block_bytes(self) -> int:
+        """Bytes that hold the block means: padded to where vectors of the processor end."""
+        return -(-self.n_blocks // 32) * 32
+
 
 def _block_size(columns: int, rows: int) -> tuple[int, int]:
     """Choose the blocks that leave out the fewest pixels, then the smallest and squarest."""
@@ -105,13 +112,15 @@ def block_means(columns: np.ndarray, geometry: Geometry) -> np.ndarray:
         geometry: Size of the blocks.
 
     Returns:
-        ``uint8``, ``(n, n_blocks)``.
+        ``uint8``, ``(n, n_block_bytes)``, zero from ``n_blocks`` on.
     """
     block_w, block_h = geometry.block
     across, down = columns.shape[1] // block_w, geometry.height // block_h
     blocks = columns[:, : across * block_w, : down * block_h]
     sums = blocks.reshape(len(columns), across, block_w, down, block_h).sum((2, 4), np.uint32)
-    return (sums // (block_w * block_h)).astype(np.uint8).reshape(len(columns), -1)
+    means = np.zeros((len(columns), geometry.n_block_bytes), np.uint8)
+    means[:, : geometry.n_blocks] = (sums // (block_w * block_h)).reshape(len(columns), -1)
+    return means
 
 
 def template_blocks(template: np.ndarray, geometry: Geometry) -> np.ndarray:
@@ -133,7 +142,7 @@ def find_nearest(
 
     Args:
         pixels: Templates, ``uint8``, ``(n, width * height)``, column after column.
-        blocks: Their block means, ``(n, n_blocks)``.
+        blocks: Their block means, ``(n, n_block_bytes)``.
         query: View, ``uint8``, ``(width, height)``.
         geometry: Of both.
         limit: What is farther need not be the nearest, only farther: the search may stop.
@@ -146,14 +155,14 @@ def find_nearest(
     if n == 0:
         return Nearest(-1, 0, 0)
     if n < PRUNE_FROM or not geometry.n_blocks:
-        return _nearest_of(pixels, query, geometry)
+        return _among(pixels, None, query, geometry)
     bounds = lower_bounds(blocks, query, geometry)
     probes = np.argpartition(bounds, _PROBES)[:_PROBES]
     probes = np.union1d(probes, [i for i in hints if 0 <= i < n]).astype(np.int64)
     best = _among(pixels, probes, query, geometry)
     left = np.flatnonzero(bounds <= min(best.distance, limit))
     if len(left) > n // 3:
-        return _nearest_of(pixels, query, geometry)
+        return _among(pixels, None, query, geometry)
     found = _among(pixels, left, query, geometry) if len(left) else best
     return min(found, best, key=lambda nearest: (nearest.distance, nearest.id))
 
@@ -169,7 +178,7 @@ def lower_bounds(blocks: np.ndarray, query: np.ndarray, geometry: Geometry) -> n
              for o in geometry.offsets]
         )  # fmt: skip
     means = block_means(shifted, geometry)
-    apart, _ = cv2.batchDistance(blocks, means, cv2.CV_32S, normType=cv2.NORM_L1, K=1)
+    apart, _ = _batch_distance(blocks, means)
     size = geometry.block[0] * geometry.block[1]
     return apart[:, 0] * np.int32(size) - np.int32((size - 1) * geometry.n_blocks)
 
@@ -177,26 +186,71 @@ def lower_bounds(blocks: np.ndarray, query: np.ndarray, geometry: Geometry) -> n
 def distances(pixels: np.ndarray, query: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Sum of absolute differences of every template at every shift; ``int32``, ``(shifts, n)``."""
     return np.stack(
-        [
-            cv2.batchDistance(over, part, cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
-            for over, part in _overlaps(pixels, query, geometry)
-        ]
+        [_batch_distance(over, part)[0][:, 0] for over, part in _overlaps(pixels, query, geometry)]
     )
+
+
+def near_pairs(
+    pixels: np.ndarray, query: np.ndarray, geometry: Geometry, slack: int, mask: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find all templates and shifts that are nearly as near as the nearest.
+
+    Args:
+        pixels: As for :func:`find_nearest`.
+        query: View, ``uint8``, ``(width, height)``.
+        geometry: Of both.
+        slack: Sum of absolute differences that one may be farther.
+        mask: ``uint8``, ``(1, n)``: templates to look at, at least one; ``None``: all.
+
+    Returns:
+        Template, index of the shift, and distance, of each pair.
+    """
+    k = min(_LISTED, len(pixels))
+    lists = [
+        _batch_distance(part, over, k, mask) for over, part in _overlaps(pixels, query, geometry)
+    ]
+    apart = np.concatenate([listed for listed, _ in lists])
+    near = apart <= apart[:, 0].min() + slack
+    if near[:, -1].any() and k < len(pixels):  # a list may end too early
+        apart = distances(pixels, query, geometry)
+        if mask is not None:
+            apart[:, mask[0] == 0] = np.iinfo(np.int32).max
+        shifts, ids = np.nonzero(apart <= apart.min() + slack)
+        return ids, shifts, apart[shifts, ids]
+    shifts, _ = np.nonzero(near)
+    return np.concatenate([ids for _, ids in lists])[near], shifts, apart[near]
+
+
+def _among(
+    pixels: np.ndarray, ids: np.ndarray | None, query: np.ndarray, geometry: Geometry
+) -> Nearest:
+    """Compare with these templates, or all; a part at a time, that they stay in the cache."""
+    best: Nearest | None = None
+    for first in range(0, len(pixels) if ids is None else len(ids), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        part = pixels[some] if ids is None else pixels.take(ids[some], axis=0)
+        found = _nearest_of(part, query, geometry)
+        found = found._replace(id=int(first + found.id if ids is None else ids[first + found.id]))
+        if best is None or found[1::-1] < best[1::-1]:
+            best = found
+    return best
 
 
 def _nearest_of(pixels: np.ndarray, query: np.ndarray, geometry: Geometry) -> Nearest:
     best: Nearest | None = None
     for shift, (over, part) in enumerate(_overlaps(pixels, query, geometry)):
-        apart, at = cv2.batchDistance(part, over, cv2.CV_32S, normType=cv2.NORM_L1, K=1)
+        apart, at = _batch_distance(part, over)
         found = Nearest(int(at[0, 0]), int(apart[0, 0]), geometry.offsets[shift])
         if best is None or found[1::-1] < best[1::-1]:
             best = found
     return best
 
 
-def _among(pixels: np.ndarray, ids: np.ndarray, query: np.ndarray, geometry: Geometry) -> Nearest:
-    found = _nearest_of(pixels[ids], query, geometry)
-    return found._replace(id=int(ids[found.id]))
+def _batch_distance(
+    these: np.ndarray, those: np.ndarray, k: int = 1, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each of these rows, the ``k`` nearest of those: distances, rising, and numbers."""
+    return cv2.batchDistance(these, those, cv2.CV_32S, None, None, cv2.NORM_L1, k, mask)
 
 
 def _overlaps(

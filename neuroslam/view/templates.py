@@ -13,8 +13,8 @@ from neuroslam.view.preprocess import encode
 from neuroslam.view.search import (
     Geometry,
     Nearest,
-    distances,
     find_nearest,
+    near_pairs,
     template_blocks,
 )
 
@@ -55,7 +55,7 @@ class LocalViewCells(nn.Module):
         n_pixels = config.template_width * config.template_height
         columns = {
             "pixels": ((n_pixels,), torch.uint8),  # column after column
-            "blocks": ((self.geometry.n_blocks,), torch.uint8),
+            "blocks": ((self.geometry.n_block_bytes,), torch.uint8),
         }
         self._exact = config.precision == "float64"
         if self._exact:
@@ -180,33 +180,37 @@ class LocalViewCells(nn.Module):
         over N pixels by at most N levels: what is nearest is within 2 N of the nearest in bytes.
         """
         nothing = Nearest(NO_TEMPLATE, 0, 0), -1.0
-        ids = np.arange(self.n)
+        mask = None
         if self.config.mean_gate:
             means = self.templates["mean"].numpy(force=True)
             here = view.mean() if self._exact else query.mean() / 255.0
-            ids = np.flatnonzero(np.abs(means - here) <= self.config.threshold + GATE_MARGIN)
-        if not len(ids):
+            mask = np.abs(means - here) <= self.config.threshold + GATE_MARGIN
+            if not mask.any():
+                return nothing
+            mask = mask.view(np.uint8)[None]
+        elif not self.n:
             return nothing
         g = self.geometry
-        pixels = self.templates["pixels"].numpy(force=True)
-        apart = distances(pixels if len(ids) == self.n else pixels[ids], query, g)
         slack = 2 * g.n_pixels if self._exact else 0
-        shifts, rows = np.nonzero(apart <= apart.min() + slack)
-        if not self._exact:
-            first = np.lexsort((shifts, rows))[0]
-            error = apart[shifts[first], rows[first]] / (255.0 * g.n_pixels)
-            return Nearest(int(ids[rows[first]]), 0, g.offsets[shifts[first]]), float(error)
-        values = self.templates["values"].numpy(force=True).reshape(self.n, g.width, g.height)
+        pixels = self.templates["pixels"].numpy(force=True)
+        ids, shifts, apart = near_pairs(pixels, query, g, slack, mask)
         offsets = np.array(g.offsets)[shifts]
+        errors = self._errors(ids, offsets, view) if self._exact else apart / (255.0 * g.n_pixels)
+        best = np.lexsort((shifts, ids, errors))[0]
+        return Nearest(int(ids[best]), 0, int(offsets[best])), float(errors[best])
+
+    def _errors(self, ids: np.ndarray, offsets: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """Mean absolute differences in full precision, for pairs of a template and an offset."""
+        g = self.geometry
+        values = self.templates["values"].numpy(force=True).reshape(self.n, g.width, g.height)
         part = view[g.margin : g.margin + g.overlap]
-        errors = np.empty(len(rows))
-        for at in range(0, len(rows), _AT_ONCE):
+        errors = np.empty(len(ids))
+        for at in range(0, len(ids), _AT_ONCE):
             some = slice(at, at + _AT_ONCE)
             columns = (offsets[some, None] + np.arange(g.overlap)) % g.width
-            apart = np.abs(values[ids[rows[some], None], columns] - part)
+            apart = np.abs(values[ids[some, None], columns] - part)
             errors[some] = apart.reshape(len(apart), -1).mean(axis=1)
-        best = np.lexsort((shifts, rows, errors))[0]
-        return Nearest(int(ids[rows[best]]), 0, int(offsets[best])), float(errors[best])
+        return errors
 
     def _relative_heading(self, offset: int) -> float:
         """Heading now minus heading when learnt: rolling right undoes a turn to the right."""
