@@ -146,6 +146,28 @@ class MapConfig(_Section):
     )
 
 
+class SessionConfig(_Section):
+    """How sure a brain must be before it joins its map to a stored one."""
+
+    confirm: int = Field(
+        4, ge=1, description="places that must agree on how the maps lie; 1: the first view decides"
+    )
+    drift: float = Field(
+        0.25, ge=0, le=1, description="share of the way between them by which they may disagree"
+    )
+    turn_tolerance_deg: float = Field(
+        30.0, gt=0, le=180, description="and by which the turns between them may"
+    )
+    cells: Literal["turn", "shift", "none"] = Field(
+        "turn",
+        description="how pose-cell states of a joined map move: shifted and turned; only shifted, "
+        "as the paper; not at all",
+    )
+    residual_factor: float = Field(
+        2.0, ge=1, description="links may be off by so many times what they were; more: refused"
+    )
+
+
 class BrainConfig(_Section):
     """Which cell populations a brain has, and every number in them.
 
@@ -158,6 +180,7 @@ class BrainConfig(_Section):
     view: ViewConfig = ViewConfig()
     pose_cells: PoseCellConfig = PoseCellConfig()
     map: MapConfig = MapConfig()
+    sessions: SessionConfig = SessionConfig()
     frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
     threads: int = Field(1, ge=1, description="of a run; for one brain, one is the fastest")
     max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")

@@ -21,7 +21,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align, path_length
-from neuroslam.mapping.experience import closes_loop
+from neuroslam.mapping.tables import closes_loop
 from neuroslam.types import Pose, PoseEstimate
 
 ODOMETRY, MAP, LOOP, TRUTH = "#8c8c8c", "#0072B2", "#D55E00", "#000000"

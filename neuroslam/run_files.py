@@ -17,7 +17,7 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
 from neuroslam.geometry import integrate_velocities, wrap_angles
-from neuroslam.mapping.experience import Links
+from neuroslam.mapping.tables import Links
 from neuroslam.storage import write_atomically
 from neuroslam.types import Frame, Pose, StepResult
 

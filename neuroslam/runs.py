@@ -26,7 +26,7 @@ from neuroslam.config import (
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
-from neuroslam.mapping.experience import closes_loop
+from neuroslam.mapping.tables import closes_loop
 from neuroslam.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.review import draw_map
 from neuroslam.run_files import (

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
 from neuroslam.mapping import ExperienceMap
-from neuroslam.mapping.experience import choose_action, closes_loop
+from neuroslam.mapping.experience import choose_action
+from neuroslam.mapping.tables import closes_loop
 from neuroslam.types import Motion, Pose, PoseEstimate, ViewMatch
 
 AT = PoseEstimate(5.0, 5.0, 5.0)

@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 FLOW = [
-    "errors", "types", "geometry", "config", "storage", "vision",
+    "errors", "types", "geometry", "config", "storage", "population", "vision",
     "sensors", "odometry", "view", "cells", "mapping", "brain",
     "evaluation", "drawing", "plotting", "recording", "run_files", "review", "runs", "demo",
     "experiments", "cli",

@@ -1,16 +1,23 @@
 """The brain: odometry, view, pose cells and map, composed; one frame in, one result out."""
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import nn
 
+from neuroslam.brain.merge import Match, differing_keys, merge
+from neuroslam.brain.recognition import WINDOW, Recognition, StoredViews, tolerance
+from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
-from neuroslam.errors import BadFrame
+from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.overlap import n_places
 from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.population import Population, Running, State
 from neuroslam.storage import Scalars
 from neuroslam.types import (
     NO_TEMPLATE,
@@ -24,6 +31,10 @@ from neuroslam.types import (
 from neuroslam.view.templates import LocalViewCells
 
 BLIND = ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+
+
+class Clock(Scalars, Running):
+    """Frame and time the brain is at."""
 
 
 class NavigationBrain(nn.Module):
@@ -46,15 +57,34 @@ class NavigationBrain(nn.Module):
 
     def __init__(self, config: BrainConfig | None = None) -> None:
         super().__init__()
-        self.config = config = config or BrainConfig()
-        cells = config.pose_cells
+        self.config = config or BrainConfig()
+        self.about = ("", "", "")  # source, preset and date of the next session
+        self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
+        self.stored = nn.ModuleList()
+        self._begin()
+        self.register_load_state_dict_pre_hook(_make_stored)
+        self.register_load_state_dict_post_hook(lambda module, _: module._changed())
+
+    def _begin(self) -> None:
+        """Start with an empty map."""
+        config, cells = self.config, self.config.pose_cells
         self.odometry = VisualOdometry(config.odometry)
         self.view = LocalViewCells(config.view)
         self.pose_cells = PoseCellNetwork(cells)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
         )
-        self.clock = Scalars(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
+        self.sessions = SessionLog()
+        self.recognition = Recognition()
+        self._changed()
+
+    def _changed(self) -> None:
+        """Forget what follows from the stored maps."""
+        self._stored_views: StoredViews | None = None
+
+    def populations(self) -> dict[str, Population]:
+        """Return the parts that its state is made of, by name."""
+        return {name: part for name, part in self.named_children() if name != "stored"}
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:
@@ -71,11 +101,17 @@ class NavigationBrain(nn.Module):
             view = BLIND if frame.image is None else self.view(frame.image)
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
+        if not self.sessions.sessions:
+            self._name_session(frame)
         cells = self.pose_cells(motion, view)
         action, experience = self.map(motion, view, cells, frame.index)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
         self.clock.after_gap_s = -math.inf
+        self.sessions.now.frames += 1
+        if len(self.stored) and action in ("create", "link") and self._recognise(frame, view):
+            view = view._replace(template=self.view.last.template, is_new=False)
+            cells, action, experience = self.pose_cells.estimate, "set", self.map.current
         return StepResult(
             frame=frame.index,
             time_s=frame.time_s,
@@ -89,6 +125,151 @@ class NavigationBrain(nn.Module):
             n_experiences=self.map.n,
             n_links=self.map.n_links,
         )
+
+    def store(self, other: "NavigationBrain") -> None:
+        """Remember the maps of another brain; when one is recognised, it is joined to this map.
+
+        Args:
+            other: It is not altered; the maps that it has stored itself are taken too.
+
+        Raises:
+            ConfigError: If views or pose cells of the two were made with different configs.
+        """
+        differing = differing_keys(self.config, other.config)
+        if differing:
+            raise ConfigError(
+                f"a stored map was made with another config: {'; '.join(differing)}; "
+                "run with the stored map's config"
+            )
+        for one in (other, *other.stored):
+            if one.map.n:
+                copy = NavigationBrain(one.config)
+                copy.take(one.state_dict(), [])
+                self.stored.append(copy)
+                self.recognition.store()
+        self._changed()
+
+    def start_new_map(self, why: str = "carried") -> None:
+        """Go on with an empty map, for the robot is no longer where it was.
+
+        The map so far is stored; it is joined again when a place of it is recognised.
+
+        Args:
+            why: ``carried``, or ``gap``; kept with the new session.
+        """
+        if not self.map.n:
+            return
+        before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
+        kept = NavigationBrain(self.config)
+        kept.take({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
+        self.stored.append(kept)
+        self._begin()
+        for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
+            self.recognition.tally.append(alike=alike, agreed=agreed)
+        self.recognition.store()
+        session = Session(
+            session_id(before.id, clock.frames_seen, why),
+            before.source,
+            before.preset,
+            before.recorded,
+            clock.frame + 1,
+            clock.time_s,
+            began=why,
+        )
+        self._open(session)
+
+    def take(self, state: State, stored: Sequence["NavigationBrain"]) -> None:
+        """Go on with another state, and with these stored maps."""
+        self._begin()
+        self.stored = nn.ModuleList(stored)
+        own = {name: value for name, value in state.items() if not name.startswith("stored.")}
+        for i, one in enumerate(stored):
+            own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
+        self.load_state_dict(own)
+
+    def _name_session(self, frame: Frame) -> None:
+        """Open a session, or give the one that was announced its id, by what it begins with."""
+        self._open(
+            Session(
+                session_id(
+                    self.config.model_dump_json(),
+                    *self.about,
+                    [session.id for one in self.stored for session in one.sessions.sessions],
+                    frame.index,
+                    float(frame.time_s),
+                    frame.image,
+                    frame.velocity,
+                ),
+                *self.about,
+                frame.index,
+                float(frame.time_s),
+            )
+        )
+
+    def _open(self, session: Session) -> None:
+        self.sessions.sessions.append(session)
+        self.map.state.session = session.id
+
+    def _recognise(self, frame: Frame, view: ViewMatch) -> bool:
+        """Join a stored map if this place is surely one of it."""
+        config, recognition = self.config.sessions, self.recognition
+        recognition.arrive(WINDOW * config.confirm)
+        if self._stored_views is None:
+            self._stored_views = StoredViews([one.view for one in self.stored])
+        encoded = self.view.encode(frame.image)
+        where, seen = self._stored_views.search(encoded)
+        if seen.template == NO_TEMPLATE:
+            return False
+        loaded = self.stored[where].map
+        templates = loaded.experiences["template"].numpy()
+        recognition.note(
+            where,
+            np.flatnonzero(templates == seen.template),
+            self.map.current,
+            seen.relative_heading_rad - view.relative_heading_rad,
+            seen.error,
+        )
+        cells = self.config.pose_cells
+        place_m = cells.create_threshold_cells * cells.cell_size_m
+        limits = tolerance((loaded, self.map), config, place_m, config.confirm)
+        agreed = recognition.confirmed(where, loaded, self.map, limits)
+        if n_places(agreed) < config.confirm:
+            return False
+        apart = np.linalg.norm((loaded.poses - loaded.poses[agreed.loaded[-1]])[:, :2], axis=1)
+        match = Match(
+            loaded=int(agreed.loaded[-1]),
+            partial=self.map.current,
+            turn_rad=float(agreed.turn_rad[-1]),
+            error=seen.error,
+            runner_up=self._stored_views.best_of(
+                encoded, where, np.unique(templates[apart <= limits.near_m])
+            ),
+            others=agreed.pick(slice(-1)),
+        )
+        return self._join(where, match, frame)
+
+    def _join(self, where: int, match: Match, frame: Frame) -> bool:
+        rest = [one for i, one in enumerate(self.stored) if i != where]
+        loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
+        self.stored = nn.ModuleList()  # what else is stored is neither copied nor looked at
+        merged, report = merge(loaded, self, match)
+        self.stored = everything
+        report.at_frame = frame.index
+        if merged is None:
+            self.recognition.forget()
+            self.sessions.refusals.append(report.to_dict())
+            return False
+        merged.sessions.merges[-1] = report.to_dict()
+        for name, part in merged.populations().items():
+            setattr(self, name, part)
+        self.stored = nn.ModuleList(rest)
+        self._changed()
+        for i, row in enumerate(
+            zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
+        ):
+            if i != where:
+                self.recognition.tally.append(alike=row[0], agreed=row[1])
+        return True
 
     def place(self, experience: int, offset: Pose) -> Pose:
         """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.
@@ -134,3 +315,11 @@ class NavigationBrain(nn.Module):
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
         return self.odometry(frame.image, dt_s)
+
+
+def _make_stored(module: NavigationBrain, state: State, prefix: str, *_unused: object) -> None:
+    """Make as many stored maps as a state has."""
+    inside = f"{prefix}stored."
+    numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
+    if len(numbers) != len(module.stored):
+        module.stored = nn.ModuleList(NavigationBrain(module.config) for _ in numbers)

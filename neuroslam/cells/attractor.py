@@ -193,6 +193,50 @@ def path_integrate(
     return Packet(turned, origin, packet.shape)
 
 
+def moved_cells(
+    cells: np.ndarray,
+    pivot: np.ndarray,
+    shift: np.ndarray,
+    torus: tuple[int, int, int],
+    way: np.ndarray | None = None,
+) -> np.ndarray:
+    r"""Move pose-cell states on the torus so that one of them comes to lie on another.
+
+    .. math:: P' = P + \Delta \pmod n, \qquad \Delta = P_u - P_z
+
+    (Multisession RatSLAM, Eqs. 10 and 11; Eq. 10 is misprinted there.) Where a session began with
+    another heading, its ways run in other directions too, so with ``way`` they are turned,
+
+    .. math:: P' = P_u + R(\Delta_\theta)\,(P - P_z)_\text{unwrapped} \pmod n
+
+    and a robot that comes to such a place from the other session finds its activity there. How
+    often the way from :math:`P_z` to :math:`P` went round the torus is what it is nearest to.
+
+    Args:
+        cells: x, y, theta in cells, ``(n, 3)``.
+        pivot: :math:`P_z`, ``(3,)``.
+        shift: :math:`\Delta` in cells, ``(3,)``; any fraction.
+        torus: ``(n_x, n_y, n_theta)``.
+        way: Ways from the pivot as the map has them, in cells, ``(n, 2)``; ``None``: only shift.
+
+    Example:
+        >>> moved_cells(np.array([[20.5, 3.0, 1.0]]), None, np.array([1, 0, -2]), (21, 21, 36))
+        array([[ 0.5,  3. , 35. ]])
+    """
+    n = np.array(torus, dtype=np.float64)
+    moved = cells + shift
+    if way is not None:
+        apart = cells[:, :2] - pivot[:2]
+        apart = apart + n[:2] * np.round((way - apart) / n[:2])
+        angle = TWO_PI * shift[2] / n[2]
+        c, s = math.cos(angle), math.sin(angle)
+        x, y = apart.T
+        turned = np.column_stack([c * x - s * y, s * x + c * y])
+        moved[:, :2] = pivot[:2] + shift[:2] + turned
+    moved = moved % n
+    return np.where(moved >= n, 0.0, moved)  # a tiny negative rounds up to n
+
+
 def _window(size: int, n: int, low: float, high: float) -> tuple[int, int]:
     first = math.floor(low)
     return first, min(size + math.ceil(high) - first, n)

@@ -19,6 +19,7 @@ from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense,
 from neuroslam.config import PoseCellConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
+from neuroslam.population import Join, Population, State, renamed
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
@@ -38,7 +39,7 @@ def _no_slip(like: Tensor) -> list[float] | Tensor:
     return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
 
 
-class PoseCellNetwork(nn.Module):
+class PoseCellNetwork(Population):
     """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet is the pose belief.
 
     :func:`~neuroslam.cells.attractor.settle` and
@@ -266,6 +267,34 @@ class PoseCellNetwork(nn.Module):
         """Advance one frame: the view injects, the attractor settles, odometry moves it."""
         self.see(view)
         return self.integrate(motion)
+
+    @staticmethod
+    def merged(loaded: State, partial: State, join: Join) -> State:
+        """Move bindings and activity of the partial session on the torus, and join the bindings.
+
+        The activity moves too, so that the belief is where the robot is (multisession RatSLAM,
+        Algorithm 1, line 4). Fatigue of the views comes along. :func:`moved_cells` has the
+        equation.
+        """
+        kept = torch.from_numpy(join.kept_views)
+        moved = torch.from_numpy(join.view_cells).unbind(1)
+        columns = dict(zip(("x", "y", "theta"), moved, strict=True))
+        columns["decay"] = partial["bindings.decay"]
+        merged = {
+            f"bindings.{name}": torch.cat([loaded[f"bindings.{name}"], column[kept]])
+            for name, column in columns.items()
+        }
+        n_x, n_y, n_theta = join.torus
+        origin = tuple(partial["origin"].tolist())
+        x, y, theta = join.cell_shift
+        packet = Packet(partial["window"], origin, (n_theta, n_y, n_x))
+        packet = path_integrate(packet, 0.0, theta, (x, y))
+        return merged | {
+            "window": packet.values,
+            "origin": torch.tensor(packet.origin),
+            "slip": partial["slip"],
+            "last.view": renamed(partial["last.view"], join.views),
+        }
 
     def _write_buffers(self) -> None:
         packet, slip = self._now.packet, self._now.slip

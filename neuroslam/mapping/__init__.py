@@ -1,6 +1,7 @@
 """The graph of places, how it is made consistent, and ways through it."""
 
-from neuroslam.mapping.experience import ExperienceMap, Links
+from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.planning import Plan, quickest_path
+from neuroslam.mapping.tables import Links
 
 __all__ = ["ExperienceMap", "Links", "Plan", "quickest_path"]

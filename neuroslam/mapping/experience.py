@@ -1,18 +1,28 @@
 """Experience map: a graph of places that odometry builds and relaxation makes consistent."""
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
-from torch import nn
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
+from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.planning import Plan, quickest_path
 from neuroslam.mapping.relax import Relaxation
+from neuroslam.mapping.tables import (
+    ALIAS_COLUMNS,
+    EXPERIENCE_COLUMNS,
+    LINK_COLUMNS,
+    Links,
+    Origins,
+    closes_loop,
+    origin_key,
+)
+from neuroslam.population import Join, Population, State
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
@@ -24,55 +34,6 @@ from neuroslam.types import (
 )
 
 Action = Literal["none", "create", "link", "set"]
-
-
-class Links(NamedTuple):
-    """What the robot measured between experiences; arrays of one length, relative to ``source``.
-
-    Attributes:
-        source: Experience that was left.
-        target: Experience that was reached.
-        distance_m: How far the target lies from the source.
-        heading_rad: In which direction, relative to the source's heading.
-        facing_rad: Heading on arrival, relative to the source's heading.
-        duration_s: How long the way took.
-    """
-
-    source: np.ndarray
-    target: np.ndarray
-    distance_m: np.ndarray
-    heading_rad: np.ndarray
-    facing_rad: np.ndarray
-    duration_s: np.ndarray
-
-
-_LINK_COLUMNS = {
-    "source": ((), torch.int64),
-    "target": ((), torch.int64),
-    "distance_m": ((), torch.float64),
-    "heading_rad": ((), torch.float64),
-    "facing_rad": ((), torch.float64),
-    "duration_s": ((), torch.float64),
-}
-
-_EXPERIENCE_COLUMNS = {
-    "pose": ((3,), torch.float64),  # x_m, y_m, theta_rad
-    "cell": ((3,), torch.float64),  # pose-cell estimate when it was made: x, y, theta
-    "template": ((), torch.int64),
-    "first_frame": ((), torch.int64),
-}
-
-
-def closes_loop(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Tell which links join places that were both known: not the way on which one was found.
-
-    Example:
-        >>> closes_loop(np.array([0, 1, 2]), np.array([1, 2, 0])).tolist()
-        [False, False, True]
-    """
-    first = np.zeros(len(target), dtype=bool)
-    first[np.unique(target, return_index=True)[1]] = True
-    return ~(first & (target > source))
 
 
 def choose_action(
@@ -117,12 +78,13 @@ def choose_action(
     return ("none", current) if found == current else ("link", found)
 
 
-class ExperienceMap(nn.Module):
+class ExperienceMap(Population):
     """Graph of experiences (places with a view and a pose-cell state) and the links between them.
 
     The robot's pose is the pose of the current experience and the odometry accumulated since.
     ``forward`` takes one frame: odometry, action, relaxation. State: the tables ``experiences``,
-    ``links_table``, ``goals`` and the numbers in ``state``.
+    ``links_table``, ``goals``, ``aliases`` (experiences that a merge made part of others) and the
+    numbers in ``state``.
 
     Args:
         config: Solver, correction, loops.
@@ -140,9 +102,10 @@ class ExperienceMap(nn.Module):
         self.config = config
         self.torus = torus
         self.threshold_cells = threshold_cells
-        self.experiences = GrowingTable(_EXPERIENCE_COLUMNS)
-        self.links_table = GrowingTable(_LINK_COLUMNS)
+        self.experiences = GrowingTable(EXPERIENCE_COLUMNS)
+        self.links_table = GrowingTable(LINK_COLUMNS)
         self.goals = GrowingTable({"experience": ((), torch.int64), "until_s": ((), torch.float64)})
+        self.aliases = GrowingTable(ALIAS_COLUMNS)
         self.state = Scalars(
             current=NO_EXPERIENCE,
             dx_m=0.0,  # map frame, since the current experience
@@ -152,6 +115,8 @@ class ExperienceMap(nn.Module):
             time_s=0.0,
             largest_correction=0.0,
             at_rest=1,
+            session=0,
+            made=0,  # experiences, in this session
         )
         self._relaxation: Relaxation | None = None  # follows from the links, made when needed
 
@@ -268,7 +233,10 @@ class ExperienceMap(nn.Module):
             cell=torch.tensor([cells.x, cells.y, cells.theta], dtype=torch.float64),
             template=template,
             first_frame=frame,
+            session=s.session,
+            number=s.made,
         )
+        s.made += 1
         if previous != NO_EXPERIENCE:
             self._add_link(previous, new, relative_heading_rad)
         self._arrive(new, relative_heading_rad)
@@ -393,6 +361,32 @@ class ExperienceMap(nn.Module):
             return None
         way = self.plan(int(self.goals["experience"][0])).path
         return way[min(1, len(way) - 1)] if way else None
+
+    @property
+    def residuals_m(self) -> np.ndarray:
+        """How far each link's target lies from where the link has it, in m, ``(links,)``."""
+        links, poses = self.links, self.poses
+        direction = poses[links.source, 2] + links.heading_rad
+        dx, dy = (poses[links.target, :2] - poses[links.source, :2]).T
+        return np.hypot(
+            dx - links.distance_m * np.cos(direction), dy - links.distance_m * np.sin(direction)
+        )
+
+    def origins(self) -> Origins:
+        """Return where every experience comes from, with those that merges made part of others."""
+        own, other = (
+            {name: table[name].numpy(force=True) for name in table.columns}
+            for table in (self.experiences, self.aliases)
+        )
+        own |= {"experience": np.arange(self.n), "turn_rad": np.zeros(self.n)}
+        apart = ~np.isin(origin_key(own), origin_key(other))  # an alias says more
+        columns = (np.concatenate([own[name][apart], other[name]]) for name in Origins._fields)
+        return Origins(*columns)
+
+    @staticmethod
+    def merged(loaded: State, partial: State, join: Join) -> State:
+        """Place the partial experiences in the loaded map and reroute their links."""
+        return merge_maps(loaded, partial, join)
 
     def _drop_finished_goals(self) -> None:
         if not self.goals.n:

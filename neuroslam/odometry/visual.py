@@ -9,10 +9,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from neuroslam.config import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.population import Running
 from neuroslam.storage import Scalars
 from neuroslam.types import Velocity
 
@@ -114,7 +115,7 @@ def motion_from_match(
     return Velocity(v if v >= config.min_speed_m_s else 0.0, w_deg_s * math.pi / 180.0)
 
 
-class VisualOdometry(nn.Module):
+class VisualOdometry(Running):
     """Measures motion by matching each picture with the one before it.
 
     The column sums of the last picture's two regions are buffers, so ``state_dict`` is complete.

@@ -2,11 +2,11 @@
 
 import numpy as np
 import torch
-from torch import nn
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
+from neuroslam.population import Join, Population, State, renamed
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.preprocess import encode
@@ -26,7 +26,7 @@ _AT_ONCE = 1024
 """Comparisons in full precision that are made together: some megabytes."""
 
 
-class LocalViewCells(nn.Module):
+class LocalViewCells(Population):
     r"""Stores views as templates and recognises them.
 
     The distance of a view :math:`q` to a template :math:`t` is the smallest mean absolute
@@ -164,6 +164,17 @@ class LocalViewCells(nn.Module):
         if self.config.mean_gate:
             row["mean"] = view.mean() if self._exact else pixels.mean() / 255.0
         return self.templates.append(**row)
+
+    @staticmethod
+    def merged(loaded: State, partial: State, join: Join) -> State:
+        """Keep the loaded templates, then the partial ones that were not matched (Eq. 9)."""
+        kept = torch.from_numpy(join.kept_views)
+        merged = {
+            name: torch.cat([loaded[name], column[kept]])
+            for name, column in partial.items()
+            if name.startswith("templates.")
+        }
+        return merged | {"last.template": renamed(partial["last.template"], join.views)}
 
     def _check(self, view: np.ndarray) -> None:
         size = (self.geometry.height, self.geometry.width)

@@ -1,0 +1,143 @@
+"""Is this a place of a stored map? Views say where it looks alike, their order whether it is."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from neuroslam.config import SessionConfig
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.population import Join, Population, State
+from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.types import NO_TEMPLATE, ViewMatch
+from neuroslam.view.search import distances
+from neuroslam.view.templates import LocalViewCells, to_bytes
+
+WINDOW = 3
+"""A match of n places may have passed this many times n others: some views are missed."""
+
+
+class StoredViews:
+    """The templates of several maps as one memory, so that one search finds the nearest of all.
+
+    Args:
+        views: Of maps with equal configs, at least one.
+    """
+
+    def __init__(self, views: Sequence[LocalViewCells]) -> None:
+        self.joined = LocalViewCells(views[0].config)
+        self.joined.templates.replace(
+            **{
+                name: torch.cat([one.templates[name] for one in views])
+                for name in self.joined.templates.columns
+            }
+        )
+        self.starts = np.cumsum([0, *(one.n for one in views)])
+
+    def search(self, view: np.ndarray) -> tuple[int, ViewMatch]:
+        """Find the nearest template of all maps; returns its map and the match.
+
+        The template is numbered as in its map; ``NO_TEMPLATE`` where none is within the threshold.
+        """
+        threshold = self.joined.config.threshold
+        match = self.joined.search(view, threshold)
+        if match.template == NO_TEMPLATE or match.error > threshold:
+            return -1, match._replace(template=NO_TEMPLATE)
+        self.joined.last.template = match.template  # the next is likely to be beside it
+        where = int(np.searchsorted(self.starts, match.template, side="right")) - 1
+        return where, match._replace(template=match.template - int(self.starts[where]))
+
+    def best_of(self, view: np.ndarray, where: int, templates: np.ndarray) -> float | None:
+        """Return the smallest difference to any template but these of map ``where``."""
+        geometry, pixels = self.joined.geometry, self.joined.templates["pixels"].numpy()
+        rest = np.ones(len(pixels), dtype=bool)
+        rest[self.starts[where] + templates] = False
+        if not rest.any():
+            return None
+        apart = distances(pixels, to_bytes(view.T), geometry).min(axis=0)
+        return float(apart[rest].min()) / (255.0 * geometry.n_pixels)
+
+
+def tolerance(
+    maps: Sequence[ExperienceMap], config: SessionConfig, place_m: float, confirm: int
+) -> Tolerance:
+    """Set what still agrees, in the scale of the maps: the usual way between two places."""
+    lengths = np.concatenate([one.links.distance_m for one in maps])
+    spacing_m = float(np.median(lengths)) if len(lengths) else place_m
+    return Tolerance(
+        near_m=2.0 * WINDOW * confirm * max(spacing_m, place_m),
+        place_m=place_m,
+        drift=config.drift,
+        turn_rad=math.radians(config.turn_tolerance_deg),
+    )
+
+
+class Recognition(Population):
+    """What was recognised of stored maps lately: the evidence for joining one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = Scalars(arrivals=0)
+        integers = ("arrival", "map", "loaded", "partial")
+        self.sightings = GrowingTable(
+            {name: ((), torch.int64) for name in integers}
+            | {name: ((), torch.float64) for name in ("turn_rad", "error")}
+        )
+        # For each stored map: how many places looked alike, how many of them agreed at best.
+        self.tally = GrowingTable({"alike": ((), torch.int64), "agreed": ((), torch.int64)})
+
+    @staticmethod
+    def merged(_loaded: State, partial: State, _join: Join) -> State:
+        """Begin anew: the ids have changed."""
+        return {
+            name: value if name.startswith("state.") else value[:0]
+            for name, value in partial.items()
+        }
+
+    def arrive(self, window: int) -> None:
+        """Note that the robot came to a place, and forget what is more than ``window`` ago."""
+        self.state.arrivals += 1
+        recent = self.sightings["arrival"] > self.state.arrivals - window
+        if not recent.all():
+            columns = {name: self.sightings[name][recent] for name in self.sightings.columns}
+            self.sightings.replace(**columns)
+
+    def note(
+        self, where: int, loaded: np.ndarray, partial: int, turn_rad: float, error: float
+    ) -> None:
+        """Note that the place looks like these places of a stored map."""
+        for one in loaded.tolist():
+            self.sightings.append(
+                arrival=self.state.arrivals, map=where, loaded=one, partial=partial,
+                turn_rad=turn_rad, error=error,
+            )  # fmt: skip
+        self.tally["alike"][where] += 1
+
+    def confirmed(
+        self, where: int, loaded: ExperienceMap, partial: ExperienceMap, limits: Tolerance
+    ) -> Pairs:
+        """Return the places that agree with the one where the robot is, that one last."""
+        of_map = {
+            name: column[self.sightings["map"] == where].numpy()
+            for name, column in ((name, self.sightings[name]) for name in self.sightings.columns)
+        }
+        pairs = Pairs(*(of_map[name] for name in Pairs._fields))
+        for group in agreeing(pairs, partial.poses, loaded.poses, limits):
+            agreed = pairs.pick(group)
+            here = agreed.partial == partial.current
+            if here.any():
+                self.tally["agreed"][where] = max(
+                    int(self.tally["agreed"][where]), n_places(agreed)
+                )
+                return agreed.pick(np.argsort(here, kind="stable"))
+        return Pairs.of([])
+
+    def store(self) -> None:
+        """Make room for the evidence of another stored map."""
+        self.tally.append(alike=0, agreed=0)
+
+    def forget(self) -> None:
+        """Drop all sightings: what they led to was tried."""
+        self.sightings.replace(**{n: self.sightings[n][:0] for n in self.sightings.columns})

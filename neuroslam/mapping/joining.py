@@ -1,0 +1,122 @@
+"""How the maps of two sessions become one: places moved, links rerouted, ids renamed."""
+
+import math
+
+import numpy as np
+import torch
+
+from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
+from neuroslam.mapping.tables import ALIAS_COLUMNS, Links, origin_key
+from neuroslam.population import Join, State, renamed
+
+_PROVENANCE = ("first_frame", "session", "number")
+
+
+def merge_maps(loaded: State, partial: State, join: Join) -> State:
+    """Place the partial experiences in the loaded map and reroute all their links.
+
+    Loaded experiences and links come first. What a link measured stays; where an end becomes
+    part of an experience that faces elsewhere, it is told relative to that. A link between
+    experiences that the loaded map has linked already is left out. Position in the map, time
+    and goals are those of the session that goes on.
+
+    (Multisession RatSLAM, Eqs. 13-17. All links of the matched experience are rerouted here;
+    the paper speaks of the last one only.)
+    """
+    ids, kept = join.experiences, join.kept_experiences
+    old = _arrays(partial)
+    pose = join.place(old["experiences.pose"])
+    pose[:, 2] = wrap_angles(pose[:, 2] - join.turns_rad)
+    cell = join.experience_cells.copy()
+    turned = join.turns_rad * join.torus[2] / TWO_PI
+    cell[:, 2] = (cell[:, 2] - turned) % join.torus[2]
+    moved = {
+        "pose": pose[kept],
+        "cell": cell[kept],
+        "template": join.views[old["experiences.template"][kept]],
+        **{name: old[f"experiences.{name}"][kept] for name in _PROVENANCE},
+    }
+    merged = _append(loaded, "experiences", moved)
+    known = _arrays(loaded)
+    merged |= _append(loaded, "links_table", _rerouted(old, known, join)._asdict())
+    merged |= _append(loaded, "aliases", _aliases(old, known, join))
+    merged |= {name: tensor for name, tensor in partial.items() if name.startswith("state.")}
+    merged |= {name: tensor for name, tensor in partial.items() if name.startswith("goals.")}
+    merged["goals.experience"] = torch.from_numpy(ids[old["goals.experience"]])
+    merged["state.current"] = renamed(partial["state.current"], ids)
+    c, s = math.cos(join.rotation_rad), math.sin(join.rotation_rad)
+    dx, dy = old["state.dx_m"].item(), old["state.dy_m"].item()
+    facing = wrap_angle(old["state.facing_rad"].item() + join.rotation_rad)
+    for name, value in (
+        ("dx_m", c * dx - s * dy),
+        ("dy_m", s * dx + c * dy),
+        ("facing_rad", facing),
+    ):
+        merged[f"state.{name}"] = torch.tensor(value, dtype=torch.float64)
+    merged["state.at_rest"] = torch.tensor(0)
+    return merged
+
+
+def _arrays(state: State) -> dict[str, np.ndarray]:
+    return {name: tensor.numpy(force=True) for name, tensor in state.items()}
+
+
+def _append(loaded: State, table: str, rows: dict[str, np.ndarray]) -> State:
+    merged = {}
+    for name, values in rows.items():
+        before = loaded[f"{table}.{name}"]
+        merged[f"{table}.{name}"] = torch.cat([before, torch.from_numpy(values).to(before)])
+    return merged
+
+
+def links_kept(partial: Links, loaded: Links, join: Join) -> np.ndarray:
+    """Tell which partial links a merge keeps: those that join places not yet linked."""
+    source, target = join.experiences[partial.source], join.experiences[partial.target]
+    there = _undirected(loaded.source, loaded.target)
+    return (source != target) & ~np.isin(_undirected(source, target), there)
+
+
+def _rerouted(old: dict[str, np.ndarray], known: dict[str, np.ndarray], join: Join) -> Links:
+    partial, loaded = (
+        Links(*(state[f"links_table.{name}"] for name in Links._fields)) for state in (old, known)
+    )
+    kept = links_kept(partial, loaded, join)
+    p = Links(*(column[kept] for column in partial))
+    turn, turn_target = join.turns_rad[p.source], join.turns_rad[p.target]
+    return p._replace(
+        source=join.experiences[p.source],
+        target=join.experiences[p.target],
+        heading_rad=_turned(p.heading_rad, turn),
+        facing_rad=_turned(p.facing_rad, turn - turn_target),
+    )
+
+
+def _turned(angle_rad: np.ndarray, by_rad: np.ndarray) -> np.ndarray:
+    return np.where(by_rad == 0.0, angle_rad, wrap_angles(angle_rad + by_rad))  # to the last bit
+
+
+def _undirected(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """One number for each pair of ids, whichever way it is named."""
+    return (np.maximum(source, target) << 32) | np.minimum(source, target)
+
+
+def _aliases(
+    old: dict[str, np.ndarray], known: dict[str, np.ndarray], join: Join
+) -> dict[str, np.ndarray]:
+    """Aliases of the partial map, those that this merge makes, without those known already."""
+    before = {name: old[f"aliases.{name}"] for name in ALIAS_COLUMNS}
+    into = before["experience"]
+    before["turn_rad"] = wrap_angles(before["turn_rad"] + join.turns_rad[into])
+    before["experience"] = join.experiences[into]
+    gone = np.flatnonzero((join.experiences < join.n_experiences) | (join.turns_rad != 0.0))
+    made = {name: old[f"experiences.{name}"][gone] for name in _PROVENANCE}
+    made |= {"experience": join.experiences[gone], "turn_rad": join.turns_rad[gone]}
+    both = {name: np.concatenate([before[name], made[name]]) for name in ALIAS_COLUMNS}
+    there = np.concatenate(
+        [
+            origin_key({name: known[f"{table}.{name}"] for name in ("session", "number")})
+            for table in ("experiences", "aliases")
+        ]
+    )
+    new = ~np.isin(origin_key(both), there)
+    return {name: column[new] for name, column in both.items()}

@@ -1,0 +1,123 @@
+"""Which recognised places of two maps can be believed: those that agree on how the maps lie."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from neuroslam.geometry import wrap_angles
+
+
+class Pairs(NamedTuple):
+    """Places of a partial map that look like places of a loaded one; arrays of one length.
+
+    Attributes:
+        partial: Experience of the partial map.
+        loaded: Experience of the loaded map.
+        turn_rad: Heading of the first minus heading of the second, as seen.
+        error: How unlike they look: mean difference of the views, 0 is equal.
+    """
+
+    partial: np.ndarray
+    loaded: np.ndarray
+    turn_rad: np.ndarray
+    error: np.ndarray
+
+    @classmethod
+    def of(cls, rows: list[tuple[int, int, float, float]]) -> Self:
+        """Make them of a list of rows."""
+        table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+        return cls(*table[:, :2].T.astype(np.int64), *table[:, 2:].T)
+
+    def pick(self, which: np.ndarray) -> Self:
+        """Return some of them, by number or by truth."""
+        return type(self)(*(column[which] for column in self))
+
+
+class Tolerance(NamedTuple):
+    """How far two places may be from where the rest has them.
+
+    Attributes:
+        near_m: Pairs farther apart than this, on either map, say nothing about each other.
+        place_m: Size of a place: so far two views of one place may be apart.
+        drift: Share of the way between two pairs by which odometry may be off.
+        turn_rad: Difference of headings.
+    """
+
+    near_m: float
+    place_m: float
+    drift: float
+    turn_rad: float
+
+
+def agreeing(
+    pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray, tolerance: Tolerance
+) -> list[np.ndarray]:
+    r"""Group the pairs that agree with each other on how one map lies in the other.
+
+    Pairs :math:`(z_i, u_i)` and :math:`(z_j, u_j)` agree if the way from :math:`z_i` to
+    :math:`z_j` is that from :math:`u_i` to :math:`u_j`,
+
+    .. math:: \lVert R(-\phi_i)(z_j - z_i) - R(-\psi_i)(u_j - u_i) \rVert
+              \le \epsilon + \delta \lVert z_j - z_i \rVert
+
+    with :math:`\phi_i` the heading at :math:`z_i` and :math:`\psi_i` that at :math:`u_i` turned by
+    what was seen; and if the headings turn alike. Only ways of at most ``near_m`` are compared, for
+    over longer ones two maps may well disagree. A group holds each partial place once, and is
+    ordered as given.
+
+    Args:
+        pairs: What was recognised; a place may be in several.
+        partial_poses: x, y in metres and heading in radians, ``(n, 3)``.
+        loaded_poses: The same of the loaded map, ``(m, 3)``.
+        tolerance: What is still alike.
+
+    Returns:
+        Numbers of the pairs of each group, the group of most places first.
+
+    Example:
+        >>> line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+        >>> seen = Pairs.of([(0, 1, 0, 0.01), (1, 2, 0, 0.01), (2, 3, 0, 0.01), (3, 0, 0, 0.01)])
+        >>> [g.tolist() for g in agreeing(seen, line, line, Tolerance(5.0, 0.3, 0.1, 0.5))]
+        [[0, 1, 2], [3]]
+    """
+    n = len(pairs.partial)
+    if n == 0:
+        return []
+    z, u = partial_poses[pairs.partial], loaded_poses[pairs.loaded]
+    i, j = cKDTree(z[:, :2]).query_pairs(tolerance.near_m, output_type="ndarray").T
+    apart = np.linalg.norm(z[j, :2] - z[i, :2], axis=1)
+    allowed = tolerance.place_m + tolerance.drift * apart
+    facing = u[:, 2] + pairs.turn_rad  # heading of the partial place, in the loaded map
+    there = _seen_from(z[i], z[i, 2], z[j])
+    here = _seen_from(u[i], facing[i], u[j])
+    turn = np.abs(wrap_angles((facing - z[:, 2])[i] - (facing - z[:, 2])[j]))
+    agree = np.linalg.norm(there - here, axis=1) <= allowed
+    # From the other end too: a wrong heading shows only where it is looked along.
+    there, here = _seen_from(z[j], z[j, 2], z[i]), _seen_from(u[j], facing[j], u[i])
+    agree &= np.linalg.norm(there - here, axis=1) <= allowed
+    agree &= (turn <= tolerance.turn_rad) & (pairs.partial[i] != pairs.partial[j])
+    i, j = i[agree], j[agree]
+    joined = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    _, label = connected_components(joined, directed=False)
+    support = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
+    # Of one partial place, in one group, the pair that most agree with, then the most alike.
+    order = np.lexsort((np.arange(n), pairs.error, -support, pairs.partial, label))
+    first = np.ones(n, dtype=bool)
+    first[1:] = (np.diff(label[order]) != 0) | (np.diff(pairs.partial[order]) != 0)
+    kept = np.sort(order[first])
+    groups = [kept[label[kept] == name] for name in np.unique(label)]
+    return sorted(groups, key=lambda group: (-n_places(pairs.pick(group)), group[0]))
+
+
+def n_places(pairs: Pairs) -> int:
+    """Count the places of which both maps have another: standing still confirms nothing."""
+    return min(len(np.unique(pairs.partial)), len(np.unique(pairs.loaded)))
+
+
+def _seen_from(here: np.ndarray, heading_rad: np.ndarray, there: np.ndarray) -> np.ndarray:
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    dx, dy = (there - here)[:, :2].T
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx])

@@ -1,0 +1,129 @@
+"""What every part of a brain must say: how its states from two sessions become one."""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor, nn
+
+from neuroslam.geometry import wrap_angle, wrap_angles
+from neuroslam.types import Pose
+
+State = dict[str, Tensor]
+"""A ``state_dict``, or the part of one that belongs to a population, without its prefix."""
+
+
+class Join(NamedTuple):
+    """How ids and coordinates of a partial map become those of the map it is merged into.
+
+    Attributes:
+        views: Partial view id -> merged view id, ``(n_views,)``.
+        experiences: Partial experience id -> merged experience id, ``(n_experiences,)``.
+        view_turns_rad: Heading with which a partial view was learnt, minus that of the merged
+            view, ``(n_views,)``; 0 where the view is kept.
+        turns_rad: The same of the partial experiences' headings, ``(n_experiences,)``.
+        n_views: Views of the loaded map: kept partial views follow them.
+        n_experiences: Experiences of the loaded map.
+        torus: ``(n_x, n_y, n_theta)`` of the pose cells.
+        cell_shift: By how many cells the activity moves along x, y and theta.
+        view_cells: Where partial views are bound then, x, y, theta in cells, ``(n_views, 3)``.
+        experience_cells: The same of the partial experiences, ``(n_experiences, 3)``.
+        pivot: Pose of the matched experience in the partial map.
+        onto: Pose that it takes in the merged map.
+    """
+
+    views: np.ndarray
+    experiences: np.ndarray
+    view_turns_rad: np.ndarray
+    turns_rad: np.ndarray
+    n_views: int
+    n_experiences: int
+    torus: tuple[int, int, int]
+    cell_shift: tuple[float, float, float]
+    view_cells: np.ndarray
+    experience_cells: np.ndarray
+    pivot: Pose
+    onto: Pose
+
+    @property
+    def rotation_rad(self) -> float:
+        """By how much the partial map turns."""
+        return wrap_angle(self.onto.theta_rad - self.pivot.theta_rad)
+
+    @property
+    def kept_views(self) -> np.ndarray:
+        """Ids of the partial views that are new in the merged map, in order."""
+        return np.flatnonzero(self.views >= self.n_views)
+
+    @property
+    def kept_experiences(self) -> np.ndarray:
+        """Ids of the partial experiences that are new in the merged map, in order."""
+        return np.flatnonzero(self.experiences >= self.n_experiences)
+
+    def place(self, poses: np.ndarray) -> np.ndarray:
+        r"""Move partial poses into the loaded map; the pivot comes to lie exactly ``onto``.
+
+        .. math:: x' = R(\Delta\theta)\,(x - x_z) + x_u, \quad
+                  \theta' = (\theta - \theta_z) + \theta_u
+
+        (Multisession RatSLAM, Eqs. 13 and 14; Eq. 14 is misprinted there, this is what its
+        program does.)
+
+        Args:
+            poses: x, y in metres and heading in radians, ``(n, 3)``.
+
+        Example:
+            >>> none, torus = np.empty(0, dtype=np.int64), (9, 9, 9)
+            >>> pivot, onto = Pose(1.0, 0.0, 0.0), Pose(5.0, 5.0, np.pi / 2)
+            >>> join = Join(*[none] * 4, 0, 0, torus, (0, 0, 0), *[none] * 2, pivot, onto)
+            >>> join.place(np.array([[2.0, 0.0, 0.0]])).round(9).tolist()
+            [[5.0, 6.0, 1.570796327]]
+        """
+        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
+        dx, dy = poses[:, 0] - self.pivot.x_m, poses[:, 1] - self.pivot.y_m
+        turned = wrap_angles(poses[:, 2] - self.pivot.theta_rad + self.onto.theta_rad)
+        return np.column_stack(
+            [c * dx - s * dy + self.onto.x_m, s * dx + c * dy + self.onto.y_m, turned]
+        )
+
+
+class Population(nn.Module, ABC):
+    """A part of the brain that says how it merges.
+
+    A brain is made of these alone, so that no state can be forgotten when two brains merge.
+    """
+
+    @staticmethod
+    @abstractmethod
+    def merged(loaded: State, partial: State, join: Join) -> State:
+        """Merge two states of this population into one; neither is altered.
+
+        Args:
+            loaded: State of the map that is merged into.
+            partial: State of the session that goes on.
+            join: How the partial one's ids and coordinates change.
+
+        Returns:
+            A state with the same names.
+        """
+
+
+class Running(Population):
+    """A population whose state is only about now: the session that goes on keeps its own."""
+
+    @staticmethod
+    def merged(_loaded: State, partial: State, _join: Join) -> State:
+        """Return the partial one's state."""
+        return dict(partial)
+
+
+def renamed(number: Tensor, ids: np.ndarray) -> Tensor:
+    """Look a number up in a table of ids; negative ones mean none, and stay.
+
+    Example:
+        >>> import torch
+        >>> renamed(torch.tensor(1), np.array([5, 7])).item()
+        7
+    """
+    old = int(number)
+    return number if old < 0 else number.new_tensor(int(ids[old]))
