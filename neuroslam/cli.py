@@ -46,6 +46,12 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` wrote.")]
 NoTensorboard = Annotated[bool, typer.Option("--no-tensorboard", help="Write no events/.")]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
+Confirm = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Places that must agree before maps are joined; 1: the first view decides."
+    ),
+]
 
 
 @app.command("run")
@@ -67,6 +73,16 @@ def run_command(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
     ] = None,
+    maps: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--map",
+            metavar="OLD",
+            help="Stored map to go on in, a run's folder or a brain file; several are allowed. "
+            "Without --preset or --config its config is taken.",
+        ),
+    ] = None,
+    confirm: Confirm = None,
     start: Annotated[int, typer.Option(help="First frame.")] = 0,
     stop: Stop = None,
     on_bad_frame: Annotated[
@@ -78,14 +94,20 @@ def run_command(
     ] = False,
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
-    from neuroslam.runs import resolve_config, run
+    from neuroslam.brain import read_checkpoint
+    from neuroslam.runs import brain_file, resolve_config, run
 
-    settings = resolve_config(preset, config, tuple(assignments or ()))
+    if confirm is not None:
+        assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
+    base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
+    settings = resolve_config(preset, config, tuple(assignments or ()), base)
     with _progress(source) as (on_start, on_step):
         summary = run(
             source,
             out,
             settings,
+            maps=maps or (),
+            preset=preset or "",
             start=start,
             stop=stop,
             on_bad_frame=on_bad_frame.value,
@@ -250,6 +272,14 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         f"{figures['templates']} templates, {figures['experiences']} experiences, "
         f"{figures['links']} links, {figures['loop_closures']} loop closures"
     )
+    for report in summary.merges:
+        _print_report(report)
+    for report in summary.refusals[:3]:
+        _print_report(report)
+    for stored in summary.not_joined:
+        console.print(f"not joined: the map of {', '.join(stored['sessions'])}; {stored['reason']}")
+    if summary.unplaced:
+        console.print(f"{summary.unplaced} frames are on maps that were not joined")
     if summary.accuracy:
         console.print(
             f"error against the truth (ATE, rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
@@ -263,6 +293,16 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         _complain(command, f"interrupted; go on with: neuroslam resume {out}")
         return INTERRUPTED
     return 0
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    from neuroslam.brain.merge import MergeReport
+
+    first, *others = MergeReport(**report).lines()
+    at = "" if report["at_frame"] is None else f"frame {report['at_frame']}: "
+    console.print(f"{at}{first}")
+    for line in others:
+        console.print(f"  {line}")
 
 
 def _complain(command: str, text: str) -> None:

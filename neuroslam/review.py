@@ -54,10 +54,12 @@ def evaluate(
         i, j = associate(found.times_s, true.times_s)
         estimate, reference = found.poses[i], true.poses[j]
     else:
-        reference = None if out is None else true_poses(read_trace(out, len(found.times_s)))
-        if reference is None:
+        trace = None if out is None else read_trace(out, len(found.times_s))
+        true_track = None if trace is None else true_poses(trace)
+        if true_track is None:
             raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
-        estimate = found.poses
+        i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
+        estimate, reference = found.poses[i], true_track[j]
     if len(estimate) < 2:
         raise RunError(
             f"{track}: {len(estimate)} of its frames have a true pose of their time; expected two"
@@ -99,13 +101,15 @@ def draw_map(
 ) -> None:
     """Draw ``map.png`` of a run."""
     links, truth = brain.map.links, true_poses(trace)
-    name = "/".join(Path(plan.source).parts[-2:]).replace("$", r"\$")  # a $ would begin a formula
+    track = trajectory(brain, trace)[:, :2]
+    on_map = np.isfinite(track[:, 0])
+    name = plan.name.replace("$", r"\$")  # a $ would begin a formula
     figure = plot_map(
         brain.map.poses,
         np.column_stack([links.source, links.target]),
         odometry_xy=odometry_track(brain.config, trace)[:, :2],
-        track_xy=trajectory(brain, trace)[:, :2],
-        truth_xy=None if truth is None else truth[:, :2],
+        track_xy=track[on_map],
+        truth_xy=None if truth is None else truth[on_map, :2],
         current=brain.map.pose,
         title=f"{name}: {len(trace['time_s'])} frames",
     )

@@ -17,7 +17,7 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
 from neuroslam.geometry import integrate_velocities, wrap_angles
-from neuroslam.mapping.tables import Links
+from neuroslam.mapping.tables import Links, origin_key
 from neuroslam.storage import write_atomically
 from neuroslam.types import Frame, Pose, StepResult
 
@@ -28,7 +28,7 @@ FRAME_COLUMNS = (
 
 # One row a frame in trace.f64: what trajectory.tum and map.png need and frames.csv lacks.
 TRACE_COLUMNS = (
-    "time_s", "experience", "dx_m", "dy_m", "dtheta_rad", "v_m_s", "w_rad_s", "dt_s",
+    "time_s", "session", "number", "dx_m", "dy_m", "dtheta_rad", "v_m_s", "w_rad_s", "dt_s",
     "truth_x_m", "truth_y_m", "truth_theta_rad",
 )  # fmt: skip
 
@@ -49,6 +49,12 @@ class RunPlan:
     start: int = 0
     stop: int | None = None
     on_bad_frame: OnBadFrame = "stop"
+    maps: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The source as a reader knows it: the last two parts of its path."""
+        return "/".join(Path(self.source).parts[-2:])
 
     @property
     def skips(self) -> bool:
@@ -61,6 +67,8 @@ class RunPlan:
         if self.stop is not None:
             lines.append(f"stop = {self.stop}")
         lines.append(f'on_bad_frame = "{self.on_bad_frame}"')
+        if self.maps:
+            lines.append(f"maps = {json.dumps(self.maps, ensure_ascii=False)}")
         return "\n".join(["\n[run]", *lines]) + "\n"
 
 
@@ -144,7 +152,7 @@ class RowWriter:
             f"{r.n_templates},{r.n_experiences},{r.n_links}\n"
         )
         truth = frame.truth or (math.nan, math.nan, math.nan)
-        row = (r.time_s, r.experience, *brain.map.offset, *r.motion, *truth)
+        row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion, *truth)
         self.trace.write(np.array(row, dtype="<f8").tobytes())
 
 
@@ -172,13 +180,24 @@ def read_trace(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray
 def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
     """Place every frame on the final map: each keeps its offset from its experience.
 
+    The trace may be of any session that the map holds.
+
     Returns:
-        x, y in metres and heading in radians, shape ``(frames, 3)``.
+        x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the frame's place
+        is not of this map: it is of a stored one that was not joined.
     """
-    experience = trace["experience"].astype(np.int64)
-    at = np.zeros((len(experience), 3))
-    known = experience >= 0
-    at[known] = brain.map.poses[experience[known]]
+    origins = brain.map.origins()
+    keys = origin_key(origins._asdict())
+    own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
+    order = np.argsort(keys)
+    at = np.full((len(own), 3), np.nan)
+    if len(keys):
+        found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
+        known = (keys[found] == own) & (trace["number"] >= 0)
+        at[known] = brain.map.poses[origins.experience[found[known]]]
+        at[known, 2] += origins.turn_rad[found[known]]
+    if not brain.sessions.merges:
+        at[trace["number"] < 0] = 0.0  # before the first experience
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     x = at[:, 0] + c * trace["dx_m"] - s * trace["dy_m"]
     y = at[:, 1] + s * trace["dx_m"] + c * trace["dy_m"]
@@ -246,7 +265,8 @@ def read_plan(out: str | Path) -> RunPlan:
     """
     path = Path(out) / "config.toml"
     try:
-        return RunPlan(**tomllib.loads(path.read_text(encoding="utf-8"))["run"])
+        table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
+        return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
     except OSError:
         if (Path(out) / "frames.csv").exists():
             raise RunError(

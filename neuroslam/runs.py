@@ -5,16 +5,19 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
+from neuroslam.brain.sessions import session_name
 from neuroslam.config import (
     BrainConfig,
     build_config,
@@ -58,6 +61,10 @@ class RunSummary:
     interrupted: bool = False
     counts: dict[str, int] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
+    merges: list[dict[str, Any]] = field(default_factory=list)
+    refusals: list[dict[str, Any]] = field(default_factory=list)
+    not_joined: list[dict[str, Any]] = field(default_factory=list)
+    unplaced: int = 0
     failure: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -69,7 +76,11 @@ class RunSummary:
             "frames_per_s": self.frames / self.seconds if self.seconds else 0.0,
             "frames_per_cpu_s": self.frames / self.cpu_seconds if self.cpu_seconds else 0.0,
             **self.counts,
-            "merges": 0,
+            "merges": len(self.merges),
+            "merge_reports": self.merges,
+            "refused_merges": self.refusals,
+            "not_joined": self.not_joined,
+            "frames_on_no_joined_map": self.unplaced,
             "skipped_frames": len(self.skipped),
             "skipped": self.skipped,
             "interrupted": self.interrupted,
@@ -78,9 +89,19 @@ class RunSummary:
 
 
 def resolve_config(
-    preset: str | None = None, config: Path | None = None, assignments: tuple[str, ...] = ()
+    preset: str | None = None,
+    config: Path | None = None,
+    assignments: tuple[str, ...] = (),
+    base: BrainConfig | None = None,
 ) -> BrainConfig:
     """Lay a config file over a preset, and single assignments over both.
+
+    Args:
+        preset: Its name.
+        config: Our TOML, or an OpenRatSLAM file.
+        assignments: Texts like ``view.threshold=0.04``.
+        base: What all is laid over where there is neither preset nor file, as a stored map's
+            config; the defaults if not given.
 
     Raises:
         ConfigError: If a preset, file, key or value cannot be used.
@@ -91,6 +112,8 @@ def resolve_config(
     """
     values = read_preset(preset) if preset else {}
     origin = f"preset {preset}" if preset else "config"
+    if base is not None and not preset and config is None:
+        values = base.model_dump(exclude_none=True)
     if config is not None:
         from_file = read_config_file(config)
         from_file.pop("run", None)  # the table that config.toml of a run has besides
@@ -107,6 +130,8 @@ def run(
     out: str | Path,
     config: BrainConfig | None = None,
     *,
+    maps: Sequence[str | Path] = (),
+    preset: str = "",
     start: int = 0,
     stop: int | None = None,
     on_bad_frame: OnBadFrame = "stop",
@@ -120,7 +145,9 @@ def run(
     Args:
         source: Anything :func:`neuroslam.sensors.open_source` opens.
         out: Folder to write; made if missing.
-        config: Of the brain; the defaults if not given.
+        config: Of the brain; that of the first of ``maps``, or the defaults, if not given.
+        maps: Stored maps, as run folders or brain files: each is joined when it is recognised.
+        preset: Name of the preset that the config is from, to be remembered.
         start: First frame of the source.
         stop: Frame to stop before; the end if not given.
         on_bad_frame: ``stop`` at a frame that cannot be used, or ``skip`` and count it.
@@ -135,18 +162,25 @@ def run(
 
     Raises:
         SourceError: If the source cannot be opened, or has no frame in the range.
+        CheckpointError: If a stored map cannot be loaded.
+        ConfigError: If a stored map was made with another config.
         RunError: If ``out`` holds a run already and ``overwrite`` is off, or cannot be written.
     """
     out = Path(out)
-    config = config or BrainConfig()
     if start < 0 or (stop is not None and stop <= start):
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
-    plan = RunPlan(_absolute(source), start, stop, on_bad_frame)
+    paths = tuple(_absolute(brain_file(path)) for path in maps)
+    plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths)
     require_free(out, plan.source, overwrite)
-    opened = open_source(source, config.frame_rate_hz)  # first: nothing is written if it fails
+    stored = [load_brain(path) for path in paths]  # first: nothing is written if it fails
+    config = config or (stored[0].config if stored else BrainConfig())
+    opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(f"{source}: has {opened.n_frames} frames, none from --start {start} on")
     brain, summary = NavigationBrain(config), RunSummary()
+    brain.about = (plan.name, preset, recorded(plan.source))
+    for one in stored:
+        brain.store(one)
     _announce(on_start, stop, opened)
     with _threads(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
         steps = _steps(brain, opened, plan, summary)
@@ -293,6 +327,13 @@ def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummar
     track = trajectory(brain, trace)
     truth = true_poses(trace)
     odometry = odometry_track(brain.config, trace)
+    on_map = np.isfinite(track[:, 0])
+    summary.unplaced = int((~on_map).sum())
+    lived = {session_name(int(session)) for session in np.unique(trace["session"])}
+    for name in ("merges", "refusals"):
+        reports = getattr(brain.sessions, name)
+        setattr(summary, name, [r for r in reports if r["partial_sessions"][-1] in lived])
+    summary.not_joined = brain.not_joined()
     summary.frames = brain.clock.frames_seen
     summary.counts = {
         "templates": brain.view.n,
@@ -304,7 +345,9 @@ def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummar
         # A robot that has not moved: nothing tells how to lay its track over the truth.
         with contextlib.suppress(MapError):
             summary.accuracy = {
-                f"{name}_rmse_m": absolute_trajectory_error(xy[:, :2], truth[:, :2], "rigid").rmse
+                f"{name}_rmse_m": absolute_trajectory_error(
+                    xy[on_map, :2], truth[on_map, :2], "rigid"
+                ).rmse
                 for name, xy in (("ate", track), ("odometry_ate", odometry))
             }
     try:
@@ -314,7 +357,7 @@ def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummar
         save_brain(brain, out / "brain.safetensors")
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
-        write_tum(out / "trajectory.tum", Track(trace["time_s"], track))
+        write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
         draw_map(brain, plan, trace, out / "map.png")
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
@@ -328,6 +371,20 @@ def _absolute(source: str | Path) -> str:
     except UnicodeEncodeError:
         raise SourceError(f"{text!a}: its name is not UTF-8; rename it") from None
     return text if text.startswith("world:") else str(Path(text).resolve())
+
+
+def brain_file(path: str | Path) -> Path:
+    """Return the brain file of a run folder, or the path itself if it is none."""
+    path = Path(path)
+    return path / "brain.safetensors" if path.is_dir() else path
+
+
+def recorded(source: str) -> str:
+    """Return the day on which a recording's file was written, or nothing where there is none."""
+    path = Path(source)
+    if source.startswith("world:") or not path.exists():
+        return ""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()
 
 
 def _read_summary(out: Path) -> RunSummary:

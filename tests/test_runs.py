@@ -12,6 +12,7 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from neuroslam.brain import load_brain
@@ -263,10 +264,18 @@ def pictures(tmp_path_factory):
 def test_a_folder_of_a_worlds_pictures_and_motion_maps_like_the_world(pictures, tmp_path):
     summary = quiet_run(pictures, tmp_path / "folder")
     expected = quiet_run(WORLD, tmp_path / "world", stop=12)
-    for name in set(EQUAL) - {"config.toml", "map.png"}:
+    named_after_their_source = {"config.toml", "map.png", "trace.f64", "brain.safetensors"}
+    for name in set(EQUAL) - named_after_their_source:
         assert (tmp_path / "folder" / name).read_bytes() == (
             tmp_path / "world" / name
         ).read_bytes(), name
+    states = [
+        load_brain(tmp_path / name / "brain.safetensors").state_dict()
+        for name in ("folder", "world")
+    ]
+    for name in states[0]:
+        if "session" not in name:
+            assert torch.equal(states[0][name], states[1][name]), name
     assert summary.accuracy == expected.accuracy
 
 

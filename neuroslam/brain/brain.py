@@ -8,7 +8,13 @@ import torch
 from torch import nn
 
 from neuroslam.brain.merge import Match, differing_keys, merge
-from neuroslam.brain.recognition import WINDOW, Recognition, StoredViews, tolerance
+from neuroslam.brain.recognition import (
+    WINDOW,
+    Recognition,
+    StoredViews,
+    elsewhere,
+    tolerance,
+)
 from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
@@ -235,15 +241,13 @@ class NavigationBrain(nn.Module):
         agreed = recognition.confirmed(where, loaded, self.map, limits)
         if n_places(agreed) < config.confirm:
             return False
-        apart = np.linalg.norm((loaded.poses - loaded.poses[agreed.loaded[-1]])[:, :2], axis=1)
+        near = templates[~elsewhere(loaded, int(agreed.loaded[-1]), limits)]
         match = Match(
             loaded=int(agreed.loaded[-1]),
             partial=self.map.current,
             turn_rad=float(agreed.turn_rad[-1]),
             error=seen.error,
-            runner_up=self._stored_views.best_of(
-                encoded, where, np.unique(templates[apart <= limits.near_m])
-            ),
+            runner_up=self._stored_views.runner_up(encoded, where, near),
             others=agreed.pick(slice(-1)),
         )
         return self._join(where, match, frame)
@@ -270,6 +274,23 @@ class NavigationBrain(nn.Module):
             if i != where:
                 self.recognition.tally.append(alike=row[0], agreed=row[1])
         return True
+
+    def not_joined(self) -> list[dict[str, object]]:
+        """Say of each stored map how much of it was recognised, for the report of a run."""
+        tally, needed = self.recognition.tally, self.config.sessions.confirm
+        return [
+            {
+                "sessions": [session.name for session in one.sessions.sessions],
+                "experiences": one.map.n,
+                "places_that_look_alike": alike,
+                "places_that_agree": agreed,
+                "reason": f"{alike} places looked like one of it, {agreed} at most agreed on how "
+                f"the maps lie; {needed} must",
+            }
+            for one, alike, agreed in zip(
+                self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
+            )
+        ]
 
     def place(self, experience: int, offset: Pose) -> Pose:
         """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.

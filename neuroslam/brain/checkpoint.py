@@ -12,11 +12,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neuroslam.brain.brain import NavigationBrain
+from neuroslam.brain.sessions import Session, session_id
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError
 from neuroslam.storage import write_atomically
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _KEY = "neuroslam"  # one metadata key: safetensors does not keep the order of several
 
 
@@ -60,12 +61,12 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"{path}: no such brain file")
-    _refuse_other_formats(path)
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError) as error:
+        _say_if_a_pickle(path)
         raise CheckpointError(
             f"{path}: damaged, not readable as safetensors ({_first_line(error)}); "
             "restore it from a copy"
@@ -90,7 +91,7 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         config = build_config(about.get("config", {}), origin=str(path))
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
-    return config, tensors
+    return config, tensors if version == FORMAT_VERSION else _upgraded(tensors, config, digest)
 
 
 def load_brain(path: str | Path) -> NavigationBrain:
@@ -110,7 +111,25 @@ def load_brain(path: str | Path) -> NavigationBrain:
     return brain
 
 
-def _refuse_other_formats(path: Path) -> None:
+def _upgraded(tensors: dict[str, Tensor], config: BrainConfig, digest: str) -> dict[str, Tensor]:
+    """Bring a state of format 1, which knew no sessions, to the present one: it is one session."""
+    brain = NavigationBrain(config)
+    session = session_id(digest)
+    brain.sessions.sessions.append(Session(session, frames=int(tensors["clock.frames_seen"])))
+    fresh = brain.state_dict()
+    places, blocks = "map.experiences.template", "view.templates.blocks"
+    tensors = {name: tensors.get(name, value) for name, value in fresh.items()}
+    n = len(tensors[places])
+    tensors["map.experiences.session"] = torch.full((n,), session)
+    tensors["map.experiences.number"] = torch.arange(n)
+    tensors["map.state.session"] = torch.tensor(session)
+    tensors["map.state.made"] = torch.tensor(n)
+    more = fresh[blocks].shape[1] - tensors[blocks].shape[1]
+    tensors[blocks] = torch.nn.functional.pad(tensors[blocks], (0, more))
+    return tensors
+
+
+def _say_if_a_pickle(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(8)
     if head[:2] == b"PK" or head[:1] == b"\x80":

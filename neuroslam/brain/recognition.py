@@ -12,8 +12,7 @@ from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
 from neuroslam.population import Join, Population, State
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
-from neuroslam.view.search import distances
-from neuroslam.view.templates import LocalViewCells, to_bytes
+from neuroslam.view.templates import LocalViewCells
 
 WINDOW = 3
 """A match of n places may have passed this many times n others: some views are missed."""
@@ -49,15 +48,17 @@ class StoredViews:
         where = int(np.searchsorted(self.starts, match.template, side="right")) - 1
         return where, match._replace(template=match.template - int(self.starts[where]))
 
-    def best_of(self, view: np.ndarray, where: int, templates: np.ndarray) -> float | None:
-        """Return the smallest difference to any template but these of map ``where``."""
-        geometry, pixels = self.joined.geometry, self.joined.templates["pixels"].numpy()
-        rest = np.ones(len(pixels), dtype=bool)
-        rest[self.starts[where] + templates] = False
-        if not rest.any():
-            return None
-        apart = distances(pixels, to_bytes(view.T), geometry).min(axis=0)
-        return float(apart[rest].min()) / (255.0 * geometry.n_pixels)
+    def runner_up(self, view: np.ndarray, where: int, near: np.ndarray) -> float | None:
+        """Return the smallest difference to any template but those ``near`` of map ``where``."""
+        rest = np.setdiff1d(np.arange(self.joined.n), self.starts[where] + near)
+        return min(self.joined.differences(view, rest), default=None)
+
+
+def elsewhere(of: ExperienceMap, experience: int, limits: Tolerance) -> np.ndarray:
+    """Tell which experiences are too far from one to look like it because they are near."""
+    poses = of.poses
+    apart = np.linalg.norm((poses - poses[experience])[:, :2], axis=1)
+    return apart > limits.near_m / (2.0 * WINDOW)
 
 
 def tolerance(
@@ -66,8 +67,9 @@ def tolerance(
     """Set what still agrees, in the scale of the maps: the usual way between two places."""
     lengths = np.concatenate([one.links.distance_m for one in maps])
     spacing_m = float(np.median(lengths)) if len(lengths) else place_m
+    elsewhere_m = confirm * max(spacing_m, place_m)
     return Tolerance(
-        near_m=2.0 * WINDOW * confirm * max(spacing_m, place_m),
+        near_m=2.0 * elsewhere_m * WINDOW,
         place_m=place_m,
         drift=config.drift,
         turn_rad=math.radians(config.turn_tolerance_deg),

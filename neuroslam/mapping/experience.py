@@ -363,6 +363,15 @@ class ExperienceMap(Population):
         return way[min(1, len(way) - 1)] if way else None
 
     @property
+    def origin(self) -> tuple[int, int]:
+        """Session that made the current experience, and its number there; -1 before the first."""
+        current = self.state.current
+        if current == NO_EXPERIENCE:
+            return self.state.session, -1
+        table = self.experiences
+        return table["session"][current].item(), table["number"][current].item()
+
+    @property
     def residuals_m(self) -> np.ndarray:
         """How far each link's target lies from where the link has it, in m, ``(links,)``."""
         links, poses = self.links, self.poses

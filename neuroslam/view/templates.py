@@ -13,6 +13,7 @@ from neuroslam.view.preprocess import encode
 from neuroslam.view.search import (
     Geometry,
     Nearest,
+    distances,
     find_nearest,
     near_pairs,
     template_blocks,
@@ -89,6 +90,34 @@ class LocalViewCells(Population):
             raise MapError(f"LocalViewCells: no template {template}; there are {self.n}, from 0")
         pixels = self.templates["pixels"][template].numpy(force=True)
         return pixels.reshape(self.config.template_width, self.config.template_height).T.copy()
+
+    def stored_view(self, template: int) -> np.ndarray:
+        """Return a template as :meth:`encode` made it: grey in [0, 1], as :meth:`search` takes it.
+
+        Raises:
+            MapError: If there is no such template.
+        """
+        if self._exact and 0 <= template < self.n:
+            values = self.templates["values"][template].numpy(force=True)
+            return values.reshape(self.config.template_width, self.config.template_height).T
+        return self.template_image(template) / 255.0
+
+    def differences(self, view: np.ndarray, templates: np.ndarray) -> np.ndarray:
+        """Compare a view with these templates; smallest mean difference over the shifts of each.
+
+        Args:
+            view: As :meth:`encode` makes it.
+            templates: Ids, ``(m,)``.
+
+        Returns:
+            Differences in [0, 1], ``(m,)``, of views rounded to bytes.
+        """
+        self._check(view)
+        if not len(templates):
+            return np.empty(0)
+        pixels = self.templates["pixels"].numpy(force=True)[templates]
+        apart = distances(pixels, to_bytes(view.T), self.geometry).min(axis=0)
+        return apart / (255.0 * self.geometry.n_pixels)
 
     def search(self, view: np.ndarray, limit: float = np.inf) -> ViewMatch:
         """Find the nearest template, without learning; the lowest id of equally near ones.

@@ -1,0 +1,215 @@
+"""Where do two finished maps meet? Every view of each is looked for in the other."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from neuroslam.brain.brain import NavigationBrain
+from neuroslam.brain.merge import Match, differing_keys
+from neuroslam.brain.recognition import elsewhere, tolerance
+from neuroslam.brain.sessions import session_name
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.mapping.tables import Origins, origin_key
+from neuroslam.types import NO_TEMPLATE
+
+
+class Found(NamedTuple):
+    """Where two maps meet, or why that cannot be told.
+
+    Attributes:
+        match: ``None`` if they do not, as far as can be seen.
+        reason: How it was found, or why not, for a reader.
+        groups: Numbers of pairs that agree with each other, the most first.
+    """
+
+    match: Match | None
+    reason: str
+    groups: tuple[int, ...] = ()
+
+
+def find_match(loaded: NavigationBrain, partial: NavigationBrain) -> Found:
+    """Look for the places that two maps share.
+
+    Places that both have from a session they share are the same. Else each view of either map is
+    looked for in the other, and those are believed of which at least ``sessions.confirm`` agree on
+    how the maps lie: the largest such group, and the others that it leaves room for.
+
+    Args:
+        loaded: One brain; it is not altered.
+        partial: The other, whose config says how many must agree; it is not altered.
+    """
+    differing = differing_keys(loaded.config, partial.config)
+    if differing:
+        return Found(
+            None, f"views or pose cells were made with different configs: {'; '.join(differing)}"
+        )
+    for name, brain in (("first", loaded), ("second", partial)):
+        if not brain.map.n:
+            return Found(None, f"the {name} map is empty")
+    shared = _shared_history(loaded, partial)
+    if shared is not None:
+        return shared
+    pairs, best = _alike(loaded, partial)
+    threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
+    if not len(pairs.partial):
+        nearest = "" if best is None else f"; the most alike that was met differ by {best:.4f}"
+        return Found(
+            None, f"no view of one looks like a view of the other within {threshold:g}{nearest}"
+        )
+    cells = partial.config.pose_cells
+    place_m = cells.create_threshold_cells * cells.cell_size_m
+    limits = tolerance((loaded.map, partial.map), partial.config.sessions, place_m, confirm)
+    groups = [pairs.pick(g) for g in agreeing(pairs, partial.map.poses, loaded.map.poses, limits)]
+    sizes = tuple(n_places(group) for group in groups)
+    if sizes[0] < confirm:
+        return Found(
+            None,
+            f"{len(np.unique(pairs.partial))} places look alike, but at most {sizes[0]} of them "
+            f"agree on how the maps lie, and {confirm} must (--confirm)",
+            sizes,
+        )
+    confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
+    first = confirmed[0]
+    at = int(np.argmin(first.error))
+    consistent = [g for g in confirmed[1:] if _fits(first, at, g, loaded.map, partial.map, limits)]
+    others = Pairs(*(np.concatenate(columns) for columns in zip(first, *consistent, strict=True)))
+    match = Match(
+        loaded=int(first.loaded[at]),
+        partial=int(first.partial[at]),
+        turn_rad=float(first.turn_rad[at]),
+        error=float(first.error[at]),
+        runner_up=_runner_up(loaded, partial, first, at, limits),
+        others=_once(others),
+    )
+    return Found(match, f"{len(match.pairs.partial)} places are the same", sizes)
+
+
+def _alike(loaded: NavigationBrain, partial: NavigationBrain) -> tuple[Pairs, float | None]:
+    """Pairs of places whose views match, looked for both ways, and the smallest difference met."""
+    seen: dict[tuple[int, int], tuple[float, float]] = {}
+    best: float | None = None
+    threshold = partial.config.view.threshold
+    for queries, memory, sign in (
+        (partial.view, loaded.view, 1.0),
+        (loaded.view, partial.view, -1.0),
+    ):
+        for view in range(queries.n):
+            match = memory.search(queries.stored_view(view), threshold)
+            if match.template == NO_TEMPLATE:
+                continue
+            best = match.error if best is None else min(best, match.error)
+            if match.error > threshold:
+                continue
+            memory.last.template = match.template  # the next is likely to be beside it
+            key = (view, match.template) if sign > 0 else (match.template, view)
+            row = (sign * match.relative_heading_rad, match.error)
+            if key not in seen or row[1] < seen[key][1]:
+                seen[key] = row
+    at = [_places_of_views(brain) for brain in (partial, loaded)]
+    rows = [
+        (z, u, turn, error)
+        for (view_z, view_u), (turn, error) in seen.items()
+        for z in at[0].get(view_z, ())
+        for u in at[1].get(view_u, ())
+    ]
+    return Pairs.of(sorted(rows)), best
+
+
+def _places_of_views(brain: NavigationBrain) -> dict[int, list[int]]:
+    places: dict[int, list[int]] = {}
+    for experience, view in enumerate(brain.map.experiences["template"].tolist()):
+        places.setdefault(view, []).append(experience)
+    return places
+
+
+def _shared_history(loaded: NavigationBrain, partial: NavigationBrain) -> Found | None:
+    """Places that both maps have from one session; ``None`` if they share none."""
+    mine, theirs = loaded.map.origins(), partial.map.origins()
+    keys = [origin_key(o._asdict()) for o in (mine, theirs)]
+    _, i, j = np.intersect1d(*keys, return_indices=True)
+    if not len(i):
+        return None
+    one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
+    pixels = [
+        brain.view.templates["pixels"].numpy()[brain.map.experiences["template"].numpy()[o.experience]]
+        for brain, o in ((loaded, one), (partial, other))
+    ]  # fmt: skip
+    aliased = (np.isin(keys[0][i], origin_key(_aliases(loaded.map)))
+               | np.isin(keys[1][j], origin_key(_aliases(partial.map))))  # fmt: skip
+    differ = one.first_frame != other.first_frame
+    differ |= ~aliased & (pixels[0] != pixels[1]).any(axis=1)
+    if differ.any():
+        k = int(np.argmax(differ))
+        return Found(
+            None,
+            f"both hold session {session_name(int(one.session[k]))}, but its place "
+            f"{one.number[k]} is not the same in both: one of the maps was made from a copy that "
+            "went another way",
+        )
+    pairs = _once(
+        Pairs(
+            other.experience, one.experience, one.turn_rad - other.turn_rad, np.zeros(len(one[0]))
+        )
+    )
+    current = np.abs(pairs.partial - partial.map.current)
+    at = int(np.argmin(current))
+    match = Match(
+        int(pairs.loaded[at]), int(pairs.partial[at]), float(pairs.turn_rad[at]), others=pairs
+    )
+    return Found(
+        match, f"{len(pairs.partial)} places are of sessions that both maps hold", (len(i),)
+    )
+
+
+def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:
+    return {name: of.aliases[name].numpy() for name in ("session", "number")}
+
+
+def _once(pairs: Pairs) -> Pairs:
+    """Each partial place once, as the most alike has it."""
+    order = np.lexsort((pairs.error, pairs.partial))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(pairs.partial[order]) != 0
+    return pairs.pick(order[first])
+
+
+def _fits(
+    first: Pairs,
+    at: int,
+    group: Pairs,
+    loaded: ExperienceMap,
+    partial: ExperienceMap,
+    limits: Tolerance,
+) -> bool:
+    """Could odometry be so wrong on the ways between two groups that both are right?"""
+    end = int(np.argmin(group.error))
+    z, u = partial.poses, loaded.poses
+    turn = u[first.loaded[at], 2] + first.turn_rad[at] - z[first.partial[at], 2]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = z[group.partial[end], :2] - z[first.partial[at], :2]
+    expected = u[first.loaded[at], :2] + (c * dx - s * dy, s * dx + c * dy)
+    apart = np.linalg.norm(u[group.loaded[end], :2] - expected)
+    way = _way_m(partial, first.partial[at], group.partial[end]) + _way_m(
+        loaded, first.loaded[at], group.loaded[end]
+    )
+    return bool(apart <= limits.place_m + limits.drift * way)
+
+
+def _way_m(of: ExperienceMap, start: int, end: int) -> float:
+    links = of.links
+    graph = coo_array((links.distance_m + 1e-9, (links.source, links.target)), shape=(of.n, of.n))
+    return float(dijkstra(graph.tocsr(), directed=False, indices=int(start))[end])
+
+
+def _runner_up(
+    loaded: NavigationBrain, partial: NavigationBrain, pairs: Pairs, at: int, limits: Tolerance
+) -> float | None:
+    """Smallest difference of the matched view to any view of places elsewhere."""
+    templates = loaded.map.experiences["template"].numpy()
+    far = elsewhere(loaded.map, int(pairs.loaded[at]), limits)
+    rest = np.setdiff1d(templates, templates[~far])
+    view = int(partial.map.experiences["template"][pairs.partial[at]])
+    return min(loaded.view.differences(partial.view.stored_view(view), rest), default=None)
