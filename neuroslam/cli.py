@@ -33,6 +33,7 @@ console = Console(markup=False, soft_wrap=True)  # for paths: brackets in them, 
 
 INTERRUPTED = 130
 USER_ERROR = 2
+REFUSED = 3
 
 
 class OnBadFrame(StrEnum):
@@ -43,6 +44,9 @@ class OnBadFrame(StrEnum):
 
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
+MapFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Brain file, or the folder of a run.")
+]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` wrote.")]
 NoTensorboard = Annotated[bool, typer.Option("--no-tensorboard", help="Write no events/.")]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
@@ -95,7 +99,8 @@ def run_command(
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
     from neuroslam.brain import read_checkpoint
-    from neuroslam.runs import brain_file, resolve_config, run
+    from neuroslam.run_files import brain_file
+    from neuroslam.runs import resolve_config, run
 
     if confirm is not None:
         assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
@@ -129,6 +134,73 @@ def resume_command(out: RunFolder, stop: Stop = None, no_tensorboard: NoTensorbo
             out, stop=stop, tensorboard=not no_tensorboard, on_step=on_step, on_start=on_start
         )
     return _report(summary, out, "resume")
+
+
+@app.command("merge")
+def merge_command(
+    first: Annotated[
+        Path, typer.Argument(metavar="A", help="Folder or brain file of the map merged into.")
+    ],
+    second: Annotated[
+        Path, typer.Argument(metavar="B", help="Folder or brain file of the session merged.")
+    ],
+    out: Out,
+    confirm: Confirm = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+    ] = False,
+) -> int:
+    """Merge two finished sessions; exit 0 merged, 3 refused, and then nothing is written."""
+    from neuroslam.merging import merge_runs
+
+    summary, reports = merge_runs(first, second, out, confirm=confirm, overwrite=overwrite)
+    for report in reports:
+        _print_report(report.to_dict())
+    if summary is None:
+        return REFUSED
+    _print_not_joined(summary)
+    console.print(f"Written: {out}")
+    return 0
+
+
+@app.command("inspect")
+def inspect_command(path: MapFile) -> int:
+    """Say what is in a map."""
+    from neuroslam.inspection import inspect
+
+    table = Table(title=str(path), show_header=False)
+    for name, value in inspect(path):
+        table.add_row(name, value)
+    console.print(table)
+    return 0
+
+
+@app.command("verify")
+def verify_command(path: MapFile) -> int:
+    """Check a map: exit 0 if it is sound, 2 with its faults if not."""
+    from neuroslam.inspection import verify
+
+    faults = verify(path)
+    for fault in faults:
+        _complain("verify", fault)
+    if not faults:
+        console.print(f"{path}: sound")
+    return USER_ERROR if faults else 0
+
+
+@app.command("export")
+def export_command(
+    path: MapFile,
+    to: Annotated[Path, typer.Argument(metavar="TO", help="File to write.")],
+    kind: Annotated[
+        str | None, typer.Option(help="tum, g2o or graphml; as TO ends if not given.")
+    ] = None,
+) -> int:
+    """Write a map for other programs: TUM, g2o, GraphML."""
+    from neuroslam.export import export
+
+    console.print(f"Written: {export(path, to, kind)}")
+    return 0
 
 
 @app.command("demo")
@@ -276,8 +348,7 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         _print_report(report)
     for report in summary.refusals[:3]:
         _print_report(report)
-    for stored in summary.not_joined:
-        console.print(f"not joined: the map of {', '.join(stored['sessions'])}; {stored['reason']}")
+    _print_not_joined(summary)
     if summary.unplaced:
         console.print(f"{summary.unplaced} frames are on maps that were not joined")
     if summary.accuracy:
@@ -293,6 +364,11 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         _complain(command, f"interrupted; go on with: neuroslam resume {out}")
         return INTERRUPTED
     return 0
+
+
+def _print_not_joined(summary: "RunSummary") -> None:
+    for stored in summary.not_joined:
+        console.print(f"not joined: the map of {', '.join(stored['sessions'])}; {stored['reason']}")
 
 
 def _print_report(report: dict[str, Any]) -> None:

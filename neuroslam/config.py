@@ -163,6 +163,17 @@ class SessionConfig(_Section):
         description="how pose-cell states of a joined map move: shifted and turned; only shifted, "
         "as the paper; not at all",
     )
+    carried: Literal["detect", "ignore"] = Field(
+        "detect",
+        description="a robot that suddenly sees something else was carried: it goes on with a new "
+        "map, which is joined to the old one when that is recognised",
+    )
+    carried_factor: float = Field(
+        3.5, gt=1, description="suddenly: the view changes by so many times what it usually does"
+    )
+    after_gap: Literal["stop", "new_map"] = Field(
+        "stop", description="after a gap longer than max_gap_s: an error, or go on with a new map"
+    )
     residual_factor: float = Field(
         2.0, ge=1, description="links may be off by so many times what they were; more: refused"
     )

@@ -72,6 +72,12 @@ class RunPlan:
         return "\n".join(["\n[run]", *lines]) + "\n"
 
 
+def brain_file(path: str | Path) -> Path:
+    """Return the brain file of a run folder, or the path itself if it is none."""
+    path = Path(path)
+    return path / "brain.safetensors" if path.is_dir() else path
+
+
 def require_free(out: Path, source: str, overwrite: bool) -> None:
     """Make sure that a new run in a folder destroys nothing that it should not.
 
@@ -156,12 +162,15 @@ class RowWriter:
         self.trace.write(np.array(row, dtype="<f8").tobytes())
 
 
-def read_trace(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
+def read_trace(
+    out: str | Path, rows: int | None = None, min_rows: int = 1
+) -> dict[str, np.ndarray]:
     """Read ``trace.f64`` of a run: one array for each of ``TRACE_COLUMNS``.
 
     Args:
         out: Folder of the run.
         rows: So many, without what a killed run wrote after its last save; ``None``: all.
+        min_rows: It must have so many.
 
     Raises:
         RunError: If there is none, or it has fewer rows.
@@ -171,7 +180,7 @@ def read_trace(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray
         raise RunError(f"{path}: missing; is {out} a run?")
     values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
     there = len(values) // width
-    if there < (rows or 1):
+    if there < (rows or min_rows):
         raise RunError(f"{path}: damaged, {there} whole rows; expected {rows or 'some'}")
     table = values[: (rows or there) * width].reshape(-1, width)
     return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}

@@ -36,6 +36,7 @@ from neuroslam.run_files import (
     OnBadFrame,
     RowWriter,
     RunPlan,
+    brain_file,
     experiences_csv,
     links_csv,
     odometry_track,
@@ -182,7 +183,7 @@ def run(
     for one in stored:
         brain.store(one)
     _announce(on_start, stop, opened)
-    with _threads(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+    with one_thread(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
         steps = _steps(brain, opened, plan, summary)
         first = next(steps, None)  # an earlier run is not touched before this works
         if first is None:
@@ -190,7 +191,7 @@ def run(
         with RowWriter.create(out) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked)
-        return _finish(brain, plan, out, summary)
+        return write_results(brain, plan, out, summary)
 
 
 def resume(
@@ -224,12 +225,12 @@ def resume(
     summary = _read_summary(out)
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
-    with _threads(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+    with one_thread(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
         steps = _steps(brain, opened, onward, summary)
         with RowWriter.reopen(out, seen) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             _drive(brain, steps, output, recorder, summary, on_step, asked)
-        return _finish(brain, plan, out, summary)
+        return write_results(brain, plan, out, summary)
 
 
 def _announce(
@@ -288,7 +289,7 @@ def _and_why(skipped: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def _threads(n: int) -> Iterator[None]:
+def one_thread(n: int) -> Iterator[None]:
     """One is faster than more for one brain: its arrays are too small to share."""
     torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(n)
@@ -322,8 +323,21 @@ def _asked_to_stop() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _finish(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> RunSummary:
-    trace = read_trace(out)
+def write_results(
+    brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary
+) -> RunSummary:
+    """Write what a brain and its trace tell, as the files of a run.
+
+    Args:
+        brain: At the end of the run.
+        plan: What it read.
+        out: Folder that holds ``trace.f64``.
+        summary: So far; it is completed.
+
+    Raises:
+        RunError: If the folder cannot be written.
+    """
+    trace = read_trace(out, min_rows=0)
     track = trajectory(brain, trace)
     truth = true_poses(trace)
     odometry = odometry_track(brain.config, trace)
@@ -371,12 +385,6 @@ def _absolute(source: str | Path) -> str:
     except UnicodeEncodeError:
         raise SourceError(f"{text!a}: its name is not UTF-8; rename it") from None
     return text if text.startswith("world:") else str(Path(text).resolve())
-
-
-def brain_file(path: str | Path) -> Path:
-    """Return the brain file of a run folder, or the path itself if it is none."""
-    path = Path(path)
-    return path / "brain.safetensors" if path.is_dir() else path
 
 
 def recorded(source: str) -> str:

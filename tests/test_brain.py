@@ -165,6 +165,7 @@ def test_every_number_of_the_state_is_in_the_state_dict():
     """What is not a buffer, a table or a known derivative would be lost on the disk."""
     brain = seen()
     derived = {"config", "geometry", "batch", "shape", "torus", "threshold_cells", "training"}
+    derived |= {"factor", "threshold", "shift", "columns_per_rad"}  # of the config
     for name, module in brain.named_modules():
         for key, value in vars(module).items():
             if key.startswith("_") or key in derived or dataclasses.is_dataclass(value):

@@ -10,7 +10,9 @@ ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 FLOW = [
     "errors", "types", "geometry", "config", "storage", "population", "vision",
     "sensors", "odometry", "view", "cells", "mapping", "brain",
-    "evaluation", "drawing", "plotting", "recording", "run_files", "review", "runs", "demo",
+    "evaluation", "drawing", "plotting", "merge_drawing", "recording", "run_files",
+    "inspection", "export",
+    "review", "runs", "merging", "demo",
     "experiments", "cli",
 ]  # fmt: skip
 SIDE_BY_SIDE = {("odometry", "view"), ("view", "odometry")}

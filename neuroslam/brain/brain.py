@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.merge import Match, differing_keys, merge
 from neuroslam.brain.recognition import (
     WINDOW,
@@ -65,6 +66,7 @@ class NavigationBrain(nn.Module):
         super().__init__()
         self.config = config or BrainConfig()
         self.about = ("", "", "")  # source, preset and date of the next session
+        self._detects = self.config.sessions.carried == "detect"
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
         self.stored = nn.ModuleList()
         self._begin()
@@ -82,6 +84,7 @@ class NavigationBrain(nn.Module):
         )
         self.sessions = SessionLog()
         self.recognition = Recognition()
+        self.continuity = Continuity(config)
         self._changed()
 
     def _changed(self) -> None:
@@ -103,10 +106,20 @@ class NavigationBrain(nn.Module):
         """
         try:
             dt_s = self._elapsed(frame)
-            motion = Motion(*self._velocity(frame, dt_s), dt_s)
-            view = BLIND if frame.image is None else self.view(frame.image)
+            seen = None if frame.image is None else self.view.look(frame.image)
+            velocity = self._velocity(frame, dt_s)
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
+        gap = dt_s > self.config.max_gap_s
+        carried = seen is not None and self.continuity.breaks(seen) and self._detects
+        if gap or carried:
+            self.start_new_map("gap" if gap else "carried")
+            if gap or frame.velocity is None or self.config.odometry.use == "visual":
+                velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
+            dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
+        motion = Motion(*velocity, dt_s)
+        self.continuity.moved(velocity, dt_s)
+        view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
             self._name_session(frame)
         cells = self.pose_cells(motion, view)
@@ -115,7 +128,7 @@ class NavigationBrain(nn.Module):
         self.clock.frames_seen += 1
         self.clock.after_gap_s = -math.inf
         self.sessions.now.frames += 1
-        if len(self.stored) and action in ("create", "link") and self._recognise(frame, view):
+        if len(self.stored) and action in ("create", "link") and self._recognise(frame, seen, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.pose_cells.estimate, "set", self.map.current
         return StepResult(
@@ -166,10 +179,12 @@ class NavigationBrain(nn.Module):
         if not self.map.n:
             return
         before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
+        senses = self.odometry, self.continuity  # they go on: this frame is the next one's before
         kept = NavigationBrain(self.config)
         kept.take({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
         self._begin()
+        self.odometry, self.continuity = senses
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)
         self.recognition.store()
@@ -192,6 +207,11 @@ class NavigationBrain(nn.Module):
         for i, one in enumerate(stored):
             own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
         self.load_state_dict(own)
+        tally = self.recognition.tally
+        rows = {name: tally[name][: len(stored)] for name in tally.columns}
+        tally.replace(**rows)
+        while tally.n < len(stored):
+            tally.append(alike=0, agreed=0)
 
     def _name_session(self, frame: Frame) -> None:
         """Open a session, or give the one that was announced its id, by what it begins with."""
@@ -216,13 +236,12 @@ class NavigationBrain(nn.Module):
         self.sessions.sessions.append(session)
         self.map.state.session = session.id
 
-    def _recognise(self, frame: Frame, view: ViewMatch) -> bool:
+    def _recognise(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
         """Join a stored map if this place is surely one of it."""
         config, recognition = self.config.sessions, self.recognition
         recognition.arrive(WINDOW * config.confirm)
         if self._stored_views is None:
             self._stored_views = StoredViews([one.view for one in self.stored])
-        encoded = self.view.encode(frame.image)
         where, seen = self._stored_views.search(encoded)
         if seen.template == NO_TEMPLATE:
             return False
@@ -312,6 +331,8 @@ class NavigationBrain(nn.Module):
                 f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s "
                 f"of frame {self.clock.frame}; times must rise"
             )
+        if dt_s > self.config.max_gap_s and self.config.sessions.after_gap == "new_map":
+            return float(dt_s)
         if dt_s > self.config.max_gap_s:
             since_s = frame.time_s - self.clock.after_gap_s
             if 0.0 < since_s <= self.config.max_gap_s:

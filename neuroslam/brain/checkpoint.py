@@ -104,7 +104,7 @@ def load_brain(path: str | Path) -> NavigationBrain:
     brain = NavigationBrain(config)
     try:
         brain.load_state_dict(tensors)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(
             f"{path}: its state does not fit its config ({_first_line(error)})"
         ) from None

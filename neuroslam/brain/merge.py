@@ -117,7 +117,8 @@ class MergeReport:
                 f"matched place moved by {x:.2f}, {y:.2f} m"
             )
         for what, n in self.counts.items():
-            lines.append(f"{what}: {n['loaded']} + {n['partial']} -> {n['merged']}")
+            into = f" -> {n['merged']}" if "merged" in n else ""
+            lines.append(f"{what}: {n['loaded']} + {n['partial']}{into}")
         if self.residual_after_m is not None:
             lines.append(
                 f"links off by {self.residual_before_m:.4f} m before, "

@@ -111,7 +111,8 @@ def _aliases(
     gone = np.flatnonzero((join.experiences < join.n_experiences) | (join.turns_rad != 0.0))
     made = {name: old[f"experiences.{name}"][gone] for name in _PROVENANCE}
     made |= {"experience": join.experiences[gone], "turn_rad": join.turns_rad[gone]}
-    both = {name: np.concatenate([before[name], made[name]]) for name in ALIAS_COLUMNS}
+    fresh = ~np.isin(origin_key(made), origin_key(before))  # an alias of itself was turned already
+    both = {name: np.concatenate([before[name], made[name][fresh]]) for name in ALIAS_COLUMNS}
     there = np.concatenate(
         [
             origin_key({name: known[f"{table}.{name}"] for name in ("session", "number")})

@@ -166,9 +166,21 @@ class LocalViewCells(Population):
             BadFrame: If the picture is of another type or shape.
             ConfigError: If crop and template do not fit the picture.
         """
+        view = self.look(image)
+        return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False) if view is None else self.recognise(view)
+
+    def look(self, image: np.ndarray) -> np.ndarray | None:
+        """Make the template of a picture, as :meth:`encode`; ``None`` if it shows nothing.
+
+        Raises:
+            BadFrame: If the picture is of another type or shape.
+            ConfigError: If crop and template do not fit the picture.
+        """
         view, contrast = encode(image, self.config)
-        if contrast < self.config.min_contrast:
-            return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+        return None if contrast < self.config.min_contrast else view
+
+    def recognise(self, view: np.ndarray) -> ViewMatch:
+        """Recognise a view, as :meth:`encode` makes it, or store it as a new template."""
         match = self.search(view, self.config.threshold)
         if match.template == NO_TEMPLATE or match.error > self.config.threshold:
             match = ViewMatch(self.learn(view), match.error, 0.0, True)

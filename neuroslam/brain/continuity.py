@@ -1,0 +1,70 @@
+"""Was the robot carried? What it sees changes at once by more than it ever does in driving."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuroslam.config import BrainConfig
+from neuroslam.population import Running
+from neuroslam.storage import Scalars
+from neuroslam.types import Velocity
+from neuroslam.view.search import Geometry, distances
+from neuroslam.view.templates import to_bytes
+
+_SETTLED = 30
+"""Frames after which the usual change is known."""
+
+_STEP = 0.02
+"""Share by which the usual change is corrected in a frame, once it is known roughly."""
+
+
+class Continuity(Running):
+    r"""Tells from two frames whether the robot could have driven from one to the other.
+
+    The change :math:`d` between two frames is the mean difference of their views at the best shift.
+    It was carried if :math:`d > \max(\theta, f\,\tilde d)`: they would not be the same view, and
+    :math:`d` is :math:`f` times the running median. A turn faster than the views can be shifted
+    by makes such a change too, and is let pass.
+    """
+
+    before: Tensor
+
+    def __init__(self, config: BrainConfig) -> None:
+        super().__init__()
+        self.factor = config.sessions.carried_factor
+        self.threshold = config.view.threshold
+        self.shift = math.inf if config.view.panoramic else config.view.shift_match
+        self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
+        self.geometry = Geometry.of(config.view)
+        self.state = Scalars(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
+        n_pixels = config.view.template_width * config.view.template_height
+        self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
+
+    def breaks(self, view: np.ndarray) -> bool:
+        """Compare a view with the one before it, and remember it.
+
+        Args:
+            view: As :meth:`~neuroslam.view.templates.LocalViewCells.encode` makes it.
+        """
+        s, query = self.state, to_bytes(view.T)
+        before, self.before = self.before, torch.from_numpy(query.reshape(-1))
+        s.frames += 1
+        if s.frames == 1:
+            return False
+        apart = distances(before.numpy(force=True)[None], query, self.geometry).min()
+        change = float(apart) / (255.0 * self.geometry.n_pixels)
+        broken = (
+            s.frames > _SETTLED
+            and change > max(self.threshold, self.factor * s.usual)
+            and s.turned <= self.shift
+        )
+        if not broken:
+            step = max(_STEP, 1.0 / s.frames) * max(s.usual, 0.05 * self.threshold)
+            s.usual += math.copysign(step, change - s.usual)
+        return broken
+
+    def moved(self, velocity: Velocity, dt_s: float) -> None:
+        """Remember how fast the robot turned, for the next comparison."""
+        self.state.turned = abs(velocity.w_rad_s) * dt_s * self.columns_per_rad
