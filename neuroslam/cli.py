@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from neuroslam.errors import NeuroslamError
+from neuroslam.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
     from neuroslam.runs import RunSummary
@@ -270,17 +271,28 @@ def presets_command() -> int:
 
 @app.command("experiment")
 def experiment_command(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="corridor-loops or view-matching.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="One of: " + ", ".join(EXPERIMENTS))],
     out: Out,
-    data: Annotated[Path, typer.Option(help="Folder that holds tuc_slam, rtabmap_corridor.")],
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder that holds the recordings, where the experiment needs some."),
+    ] = None,
 ) -> int:
-    """Repeat an experiment on real recordings."""
+    """Repeat an experiment of a paper."""
     from neuroslam.experiments import run_experiment
 
     rows = run_experiment(name, data, out)
-    table = Table(*(key.replace("_", " ") for key in rows[0]), title=name)
-    for row in rows:
-        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values())
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    across = len(keys) > 9  # many figures of few maps: a column a map
+    table = Table(title=name, show_header=not across)
+    lines = [keys, *([row.get(key, "") for key in keys] for row in rows)]
+    if across:
+        lines = [list(line) for line in zip(*lines, strict=True)]
+    else:
+        for key in lines.pop(0):
+            table.add_column(key.replace("_", " "))
+    for line in lines:
+        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in line)
         table.add_row(*(cell.replace("_", " ") for cell in cells))
     console.print(table)
     console.print(f"Written: {out}")

@@ -1,4 +1,4 @@
-"""Experiments on recordings: each writes ``results.json`` and its figures into a folder."""
+"""Experiments of the papers: each writes ``results.json`` and its figures into a folder."""
 
 from importlib import import_module
 from pathlib import Path
@@ -6,19 +6,27 @@ from typing import Any
 
 from neuroslam.errors import RunError
 
+_SESSIONS = "neuroslam.experiments.multisession"
+
 EXPERIMENTS = {
     "corridor-loops": ("neuroslam.experiments.corridor_loops", "corridor_loops", "tuc_slam"),
     "view-matching": ("neuroslam.experiments.view_matching", "view_matching", "rtabmap_corridor"),
+    "virtual-tour": (_SESSIONS, "virtual_tour", None),
+    "virtual-tour-no-shift": (_SESSIONS, "virtual_tour_no_shift", None),
+    "lab-tour": (_SESSIONS, "lab_tour", None),
+    "five-sessions": (_SESSIONS, "five_sessions", None),
+    "campus": (_SESSIONS, "campus", None),
+    "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
 }
-"""Name -> module, function, folder of its recording."""
+"""Name -> module, function, folder of its recordings in the data; ``None``: it needs none."""
 
 
-def run_experiment(name: str, data: Path, out: Path) -> list[dict[str, Any]]:
+def run_experiment(name: str, data: Path | None, out: Path) -> list[dict[str, Any]]:
     """Run an experiment; returns its rows, with named, unit-carrying keys.
 
     Args:
         name: One of ``EXPERIMENTS``.
-        data: Folder that holds the folders of the recordings.
+        data: Folder that holds the folders of the recordings; ``None`` if it needs none.
         out: Folder to write.
 
     Raises:
@@ -27,7 +35,12 @@ def run_experiment(name: str, data: Path, out: Path) -> list[dict[str, Any]]:
     if name not in EXPERIMENTS:
         raise RunError(f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}")
     module, function, folder = EXPERIMENTS[name]
-    if not (Path(data) / folder).is_dir():
-        raise RunError(f"{Path(data) / folder}: no such recording; say where with --data")
-    result = getattr(import_module(module), function)(Path(data) / folder, Path(out))
+    recordings = None
+    if folder is not None:
+        if data is None:
+            raise RunError(f"{name}: needs a recording; say with --data which folder holds it")
+        recordings = Path(data) / folder
+        if not recordings.is_dir():
+            raise RunError(f"{recordings}: no such recording; say where with --data")
+    result = getattr(import_module(module), function)(recordings, Path(out))
     return result["rows"]

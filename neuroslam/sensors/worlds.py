@@ -97,7 +97,7 @@ def _ellipse(look: int) -> World:
 
 
 def _figure_eight(look: int) -> World:
-    """Laboratory with two loops that share their middle aisle, no odometry; 44 m a lap."""
+    """Laboratory with two loops that share an aisle, no odometry; route 2: 2, then 3 laps."""
     site, height = Site(look + 2000), 2.4
     painter = _indoors(height, paint.INDOORS)
     site.wall(_rectangle(6.5, 4.0, clockwise=True), painter)
@@ -124,14 +124,17 @@ def _figure_eight(look: int) -> World:
         description=_first_line(_figure_eight),
         ground=Surface(ground.image, 40.0, -6.6, -4.1, 0.0),
         ceiling=Surface(lights.image, 32.0, -6.6, -4.1, height),
-        routes=[rounded_route(loops, 0.8)],
+        routes=[
+            rounded_route(loops, 0.8),
+            rounded_route([*loops[:4], *loops[:4], *loops[4:], *loops[4:], *loops[4:]], 0.8),
+        ],
         sense=Sense(frames_per_lap=450, odometry=False),
         sight_m=16.0,
     )
 
 
 def _town(look: int) -> World:
-    """Small town of four blocks of houses; routes 1-4 go around one block each, 5 around all."""
+    """Small town of four blocks; routes 1-4 go around one each, 5 around all, 6: all of these."""
     site = Site(look + 3000, sun_rad=2.2)
 
     def house(rng: np.random.Generator, length: float) -> tuple[np.ndarray, float]:
@@ -165,6 +168,17 @@ def _town(look: int) -> World:
         for dx, dy in ((0.0, 0.0), (-34.0, 0.0), (-34.0, -28.0), (0.0, -28.0))
     ]
     routes.append(rounded_route(_rectangle(34.0, 28.0, clockwise=False)[:-1], 4.0))
+    inner = [  # each begins in the middle, in the direction in which the one before arrives
+        [(0.0, 0.0), (34.0, 0.0), (34.0, 28.0), (0.0, 28.0)],
+        [(0.0, 0.0), (0.0, -28.0), (34.0, -28.0), (34.0, 0.0)],
+        [(0.0, 0.0), (-34.0, 0.0), (-34.0, -28.0), (0.0, -28.0)],
+        [(0.0, 0.0), (0.0, 28.0), (-34.0, 28.0), (-34.0, 0.0)],
+    ]
+    tour = [(0.0, 28.0)]
+    for block in inner:
+        tour += block + block
+    tour += [(0.0, 0.0), (34.0, 0.0), (34.0, 28.0), (-34.0, 28.0), (-34.0, -28.0)]
+    routes.append(rounded_route([*tour, (34.0, -28.0), (34.0, 28.0)], 4.0))
     return site.build(
         name="town",
         description=_first_line(_town),
@@ -212,7 +226,7 @@ def _streets(rng: np.random.Generator) -> Surface:
 
 
 def _campus(look: int) -> World:
-    """Large campus seen all around; route 1: elliptic court, 2: park and halls, 3: everything."""
+    """Large campus seen all around; routes 1: court, 2: park, 3: everything, 4: laps of each."""
     site = Site(look + 4000, sun_rad=2.2)
 
     def hall(tall: float, stone: paint.Colour) -> Painter:
@@ -242,13 +256,17 @@ def _campus(look: int) -> World:
         site.block(*box, (90.0, 90.0), hall(site.rng.choice([6.8, 9.4, 12.0]), stone))
     park = [(9.0, -24.0), (47.0, -22.0), (68.0, -20.0), (90.0, -16.0)]
     park += [(91.0, 22.0), (48.0, 20.0), (9.0, 18.0)]
-    court = [
-        (-51.0 + 32.0 * math.cos(t), 21.0 * math.sin(t)) for t in np.radians(range(40, 321, 20))
-    ]
+
+    def court_to(last_deg: int) -> list[Point]:
+        angles = np.radians(range(40, last_deg + 1, 20))
+        return [(-51.0 + 32.0 * math.cos(t), 21.0 * math.sin(t)) for t in angles]
+
+    court = court_to(320)
     routes = [
         ellipse_route(32.0, 21.0, (-51.0, 0.0)),
         rounded_route(park, 7.0),
         rounded_route([*court, *park], 7.0),
+        rounded_route([*court_to(320 + 3 * 360), *park * 3, *[*court, *park] * 3], 7.0),
     ]
     for _ in range(400):
         if len(site.billboards) == 34:
