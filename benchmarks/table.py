@@ -5,14 +5,26 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bench_end_to_end, bench_pose_cells, bench_relaxation, bench_view_search
+from benchmarks import (
+    bench_end_to_end,
+    bench_merge,
+    bench_pose_cells,
+    bench_relaxation,
+    bench_view_search,
+)
 
 
 def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     table = Table("step", "size", "C++ reference", "target", "measured here")
-    for module in (bench_pose_cells, bench_view_search, bench_relaxation, bench_end_to_end):
+    for module in (
+        bench_pose_cells,
+        bench_view_search,
+        bench_relaxation,
+        bench_merge,
+        bench_end_to_end,
+    ):
         for row in module.rows():
             table.add_row(*row)
     Console(width=130).print(table)

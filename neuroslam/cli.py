@@ -206,18 +206,19 @@ def export_command(
 
 @app.command("demo")
 def demo_command(out: Out = Path("demo")) -> int:
-    """Map an embedded world in two sessions."""
+    """Map an embedded world in two sessions that become one map."""
     from neuroslam.demo import demo
 
     with _progress("world:corridor") as (on_start, on_step):
         rows = demo(out, on_step, on_start)
-    table = Table(title="Two laps of a corridor, brain saved and reloaded between them")
+    table = Table(title="A corridor in two sessions, the second from an unknown place")
     table.add_column("what")
     table.add_column("figure", justify="right")
     for name, value in rows:
         table.add_row(name, value)
     console.print(table)
-    console.print(f"Figures: {out / 'summary.png'}, {out / 'map.png'}; the run: {out}")
+    console.print(f"Figures: {out / 'summary.png'}, {out / 'sessions.png'}")
+    console.print(f"Runs: {out / 'first'}, {out / 'second'}")
     return 0
 
 
@@ -282,21 +283,38 @@ def experiment_command(
     from neuroslam.experiments import run_experiment
 
     rows = run_experiment(name, data, out)
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    across = len(keys) > 9  # many figures of few maps: a column a map
-    table = Table(title=name, show_header=not across)
-    lines = [keys, *([row.get(key, "") for key in keys] for row in rows)]
-    if across:
-        lines = [list(line) for line in zip(*lines, strict=True)]
-    else:
-        for key in lines.pop(0):
-            table.add_column(key.replace("_", " "))
-    for line in lines:
-        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in line)
-        table.add_row(*(cell.replace("_", " ") for cell in cells))
-    console.print(table)
+    few = len({key for row in rows for key in row}) <= 9
+    for table in [_down(rows, name)] if few else _across(rows, name):
+        console.print(table)
     console.print(f"Written: {out}")
     return 0
+
+
+def _down(rows: list[dict[str, Any]], title: str) -> Table:
+    """Make a table of a line a row."""
+    table = Table(*(key.replace("_", " ") for key in rows[0]), title=title)
+    for row in rows:
+        table.add_row(*map(_shown, row.values()))
+    return table
+
+
+def _across(rows: list[dict[str, Any]], title: str) -> Iterator[Table]:
+    """Make tables of a column a row, three columns each: for many figures of few maps."""
+    for first in range(0, len(rows), 3):
+        some = rows[first : first + 3]
+        table = Table(title=title, show_header=False)
+        for key in dict.fromkeys(key for row in some for key in row):
+            cells = [_shown(row.get(key, "")) for row in some]
+            if any(cells):
+                table.add_row(key.replace("_", " "), *cells)
+        yield table
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}" if value == value else ""  # NaN is not equal to itself
+    text = "; ".join(value) if isinstance(value, list) else str(value)
+    return text.replace("_", " ")
 
 
 @contextmanager

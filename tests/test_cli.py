@@ -469,7 +469,10 @@ def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):
     assert (presets.code, "irat" in presets.out) == (0, True)
 
 
-COMMANDS = ("run", "resume", "demo", "evaluate", "plot", "presets", "experiment")
+COMMANDS = (
+    "run", "resume", "merge", "demo", "evaluate", "plot", "inspect", "verify", "export", "presets",
+    "experiment",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)

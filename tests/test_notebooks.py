@@ -21,7 +21,11 @@ def draws(cell):
 
 
 def test_there_are_notebooks():
-    assert [path.stem for path in NOTEBOOKS] == ["01_pose_cells", "02_map_a_video"]
+    assert [path.stem for path in NOTEBOOKS] == [
+        "01_pose_cells",
+        "02_map_a_video",
+        "03_two_sessions",
+    ]
 
 
 @each_notebook

@@ -188,7 +188,7 @@ def draw(plan: Plan, result: Result, out: Path, stem: str = "") -> None:
         found.alignment.apply(here.poses[:, :2]),
         found.rmse,
         found.rmse / diagonal,
-        f"{plan.title}: the merged map laid over the single session's",
+        f"{plan.title}: merged map on the single session's",
         *links,
     )
     save(overlay, out / f"{stem}overlay.png")

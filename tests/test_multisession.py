@@ -1,0 +1,96 @@
+"""The experiments of the multisession paper, against a single session over the same frames."""
+
+import json
+
+import numpy as np
+import pytest
+
+from neuroslam.experiments import run_experiment
+from neuroslam.experiments.multisession import PLANS, run_plan, wrong_merges
+from neuroslam.sensors import open_source
+
+
+@pytest.fixture(scope="module")
+def tour(tmp_path_factory):
+    out = tmp_path_factory.mktemp("tour")
+    return out, run_experiment("virtual-tour", None, out)
+
+
+def test_the_virtual_tour_in_two_sessions_is_the_map_of_one(tour):
+    _, (single, multi) = tour
+    assert (multi["merges"], multi["maps_not_joined"]) == (1, 0)
+    assert multi["places_created_at_known_views_after_merge"] == 0
+    for what in ("templates", "experiences", "links"):
+        assert multi[what] == single[what], what
+    assert multi["icp_rmse_rigid_of_diagonal"] <= 0.005
+    assert multi["ate_rigid_m"] <= 1.2 * single["ate_rigid_m"]
+
+
+def test_an_experiment_writes_its_rows_its_merges_and_its_figures(tour):
+    out, rows = tour
+    results = json.loads((out / "results.json").read_text())
+    assert [row["experiences"] for row in results["rows"]] == [row["experiences"] for row in rows]
+    (report,) = results["merges"]
+    assert (report["merged"], report["match"]["places"] >= 4) == (True, True)
+    for name in ("stages", "bindings", "overlay", "accuracy"):
+        assert (out / f"{name}.png").stat().st_size > 20_000, name
+
+
+@pytest.mark.parametrize("cells", ["none", "shift"])
+def test_pose_cells_that_are_not_moved_and_turned_make_known_places_anew(cells, tour):
+    """Figure 12 of the paper; its own shift alone leaves the ways turned by the new heading."""
+    result = run_plan(PLANS["virtual-tour"], {"sessions": {"cells": cells}})
+    assert result.lives[-1].created_at_known > 0
+    assert result.lives[-1].brain.map.n > tour[1][0]["experiences"]
+
+
+def test_the_lab_tour_joins_where_the_rectangles_meet(tmp_path):
+    single, multi = run_experiment("lab-tour", None, tmp_path)
+    assert (multi["merges"], multi["maps_not_joined"]) == (1, 0)
+    assert multi["icp_rmse_rigid_of_diagonal"] <= 0.01
+    assert multi["ate_similarity_m"] <= 1.2 * single["ate_similarity_m"]
+
+
+def test_sessions_of_the_town_are_laps_of_a_block_each_and_the_outer_lap():
+    source = open_source(PLANS["five-sessions"].source)
+    cuts, truth = PLANS["five-sessions"].cuts(source), source.truths()[:, :2]
+    assert [cut[0] for cut in cuts[1:]] == [cut[1] for cut in cuts[:-1]]
+    assert (cuts[0][0], cuts[-1][1]) == (0, source.n_frames)
+    sides = [np.sign(np.mean(truth[a:b], axis=0)).tolist() for a, b in cuts[:-1]]
+    assert sides == [[1, 1], [1, -1], [-1, -1], [-1, 1]]
+    assert np.ptp(truth[slice(*cuts[-1])], axis=0) == pytest.approx([68.0, 56.0], abs=0.1)
+
+
+def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
+    source = open_source(PLANS["campus"].source)
+    cuts, truth = PLANS["campus"].cuts(source), source.truths()[:, 0]
+    assert source.n_frames >= 20_000
+    assert (cuts[0][0], cuts[-1][1], len(cuts)) == (0, source.n_frames, 3)
+    assert truth[slice(*cuts[0])].max() <= 10.1  # the court
+    assert truth[slice(*cuts[1])].min() >= -25.1  # the park
+    assert np.ptp(truth[slice(*cuts[2])]) > 150.0  # everything
+
+
+@pytest.mark.parametrize(("name", "k"), [("circuit_launch", 2), ("circuit_launch", 5)])
+def test_a_real_drive_in_sessions_has_the_shape_of_the_whole(name, k, shared):
+    from neuroslam.experiments.lives import measure
+    from neuroslam.experiments.multisession import Plan, equal_parts
+
+    source = shared / "data" / name / "frames.tar"
+    if not source.is_file():
+        pytest.skip(f"no {name} beside the checkout")
+    result = run_plan(Plan(name, str(source), equal_parts(k), preset="rc_car"))
+    every = np.arange(len(result.single.trace["session"]))
+    row = measure("", result.lives, result.single, every)
+    assert row["maps_not_joined"] == 0
+    assert row["icp_rmse_rigid_of_diagonal"] < 0.03
+    assert row["track_rmse_of_diagonal"] < 0.03
+
+
+def test_no_cut_of_one_drive_is_joined_to_one_of_another(shared):
+    if not (shared / "data" / "usi_track1").is_dir():
+        pytest.skip("no usi_track1 beside the checkout")
+    row = wrong_merges(shared / "data")
+    assert row["tries"] >= 50
+    assert row["merges"] == 0
+    assert all(row["reasons"])
