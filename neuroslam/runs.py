@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.sessions import session_name
 from neuroslam.config import (
     BrainConfig,
     build_config,
@@ -343,10 +342,10 @@ def write_results(
     odometry = odometry_track(brain.config, trace)
     on_map = np.isfinite(track[:, 0])
     summary.unplaced = int((~on_map).sum())
-    lived = {session_name(int(session)) for session in np.unique(trace["session"])}
+    drive = brain.sessions.this_drive() if brain.sessions.sessions else set()
     for name in ("merges", "refusals"):
         reports = getattr(brain.sessions, name)
-        setattr(summary, name, [r for r in reports if r["partial_sessions"][-1] in lived])
+        setattr(summary, name, [r for r in reports if r["partial_sessions"][-1] in drive])
     summary.not_joined = brain.not_joined()
     summary.frames = brain.clock.frames_seen
     summary.counts = {

@@ -334,7 +334,7 @@ def test_every_world_says_what_it_is():
         ("world:town?laps=many", "world 'town': option laps='many': input should be a valid .*"),
         ("world:town?laps=-1", "world 'town': option laps='-1': input should be greater than 0 .*"),
         ("world:town?laps=nan", "world 'town': option laps='nan': .* finite .*"),
-        ("world:town?route=6", "world 'town': route 6 does not exist; expected 1 to 5"),
+        ("world:town?route=7", "world 'town': route 7 does not exist; expected 1 to 6"),
     ],
 )  # fmt: skip
 def test_mistakes_are_told_in_one_line(spec, message):

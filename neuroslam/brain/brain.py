@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from neuroslam.brain.continuity import Continuity
+from neuroslam.brain.matching import shared_history
 from neuroslam.brain.merge import Match, differing_keys, merge
 from neuroslam.brain.recognition import (
     WINDOW,
@@ -162,11 +163,20 @@ class NavigationBrain(nn.Module):
             )
         for one in (other, *other.stored):
             if one.map.n:
-                copy = NavigationBrain(one.config)
-                copy.take(one.state_dict(), [])
-                self.stored.append(copy)
-                self.recognition.store()
+                self._store_one(one)
         self._changed()
+
+    def _store_one(self, one: "NavigationBrain") -> None:
+        copy = NavigationBrain(one.config)
+        copy.take(one.state_dict(), [])
+        for i, before in enumerate(self.stored):
+            shared = shared_history(before, copy)
+            merged = merge(before, copy, shared.match)[0] if shared and shared.match else None
+            if merged is not None:  # what became of one map in two sessions
+                self.stored[i] = merged
+                return
+        self.stored.append(copy)
+        self.recognition.store()
 
     def start_new_map(self, why: str = "carried") -> None:
         """Go on with an empty map, for the robot is no longer where it was.
@@ -196,6 +206,7 @@ class NavigationBrain(nn.Module):
             clock.frame + 1,
             clock.time_s,
             began=why,
+            continues=before.id,
         )
         self._open(session)
 
@@ -272,6 +283,7 @@ class NavigationBrain(nn.Module):
         return self._join(where, match, frame)
 
     def _join(self, where: int, match: Match, frame: Frame) -> bool:
+        """Join stored map ``where``, and then those that share a session with it."""
         rest = [one for i, one in enumerate(self.stored) if i != where]
         loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
         self.stored = nn.ModuleList()  # what else is stored is neither copied nor looked at
@@ -286,12 +298,16 @@ class NavigationBrain(nn.Module):
         for name, part in merged.populations().items():
             setattr(self, name, part)
         self.stored = nn.ModuleList(rest)
-        self._changed()
-        for i, row in enumerate(
-            zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
-        ):
+        rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
+        for i, (alike, agreed) in enumerate(rows):
             if i != where:
-                self.recognition.tally.append(alike=row[0], agreed=row[1])
+                self.recognition.tally.append(alike=alike, agreed=agreed)
+        self._changed()
+        for i, one in enumerate(rest):
+            shared = shared_history(one, self)
+            if shared is not None and shared.match is not None:
+                self._join(i, shared.match, frame)
+                break
         return True
 
     def not_joined(self) -> list[dict[str, object]]:

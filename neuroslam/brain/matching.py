@@ -1,12 +1,11 @@
 """Where do two finished maps meet? Every view of each is looked for in the other."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from neuroslam.brain.brain import NavigationBrain
 from neuroslam.brain.merge import Match, differing_keys
 from neuroslam.brain.recognition import elsewhere, tolerance
 from neuroslam.brain.sessions import session_name
@@ -14,6 +13,9 @@ from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
 from neuroslam.mapping.tables import Origins, origin_key
 from neuroslam.types import NO_TEMPLATE
+
+if TYPE_CHECKING:
+    from neuroslam.brain.brain import NavigationBrain
 
 
 class Found(NamedTuple):
@@ -30,7 +32,7 @@ class Found(NamedTuple):
     groups: tuple[int, ...] = ()
 
 
-def find_match(loaded: NavigationBrain, partial: NavigationBrain) -> Found:
+def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     """Look for the places that two maps share.
 
     Places that both have from a session they share are the same. Else each view of either map is
@@ -49,7 +51,7 @@ def find_match(loaded: NavigationBrain, partial: NavigationBrain) -> Found:
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:
             return Found(None, f"the {name} map is empty")
-    shared = _shared_history(loaded, partial)
+    shared = shared_history(loaded, partial)
     if shared is not None:
         return shared
     pairs, best = _alike(loaded, partial)
@@ -87,7 +89,7 @@ def find_match(loaded: NavigationBrain, partial: NavigationBrain) -> Found:
     return Found(match, f"{len(match.pairs.partial)} places are the same", sizes)
 
 
-def _alike(loaded: NavigationBrain, partial: NavigationBrain) -> tuple[Pairs, float | None]:
+def _alike(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Pairs, float | None]:
     """Pairs of places whose views match, looked for both ways, and the smallest difference met."""
     seen: dict[tuple[int, int], tuple[float, float]] = {}
     best: float | None = None
@@ -118,15 +120,20 @@ def _alike(loaded: NavigationBrain, partial: NavigationBrain) -> tuple[Pairs, fl
     return Pairs.of(sorted(rows)), best
 
 
-def _places_of_views(brain: NavigationBrain) -> dict[int, list[int]]:
+def _places_of_views(brain: "NavigationBrain") -> dict[int, list[int]]:
     places: dict[int, list[int]] = {}
     for experience, view in enumerate(brain.map.experiences["template"].tolist()):
         places.setdefault(view, []).append(experience)
     return places
 
 
-def _shared_history(loaded: NavigationBrain, partial: NavigationBrain) -> Found | None:
-    """Places that both maps have from one session; ``None`` if they share none."""
+def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found | None:
+    """Find the places that two maps have from one session; ``None`` if they share no session.
+
+    Args:
+        loaded: One brain; it is not altered.
+        partial: The other; it is not altered.
+    """
     mine, theirs = loaded.map.origins(), partial.map.origins()
     keys = [origin_key(o._asdict()) for o in (mine, theirs)]
     _, i, j = np.intersect1d(*keys, return_indices=True)
@@ -205,7 +212,7 @@ def _way_m(of: ExperienceMap, start: int, end: int) -> float:
 
 
 def _runner_up(
-    loaded: NavigationBrain, partial: NavigationBrain, pairs: Pairs, at: int, limits: Tolerance
+    loaded: "NavigationBrain", partial: "NavigationBrain", pairs: Pairs, at: int, limits: Tolerance
 ) -> float | None:
     """Smallest difference of the matched view to any view of places elsewhere."""
     templates = loaded.map.experiences["template"].numpy()

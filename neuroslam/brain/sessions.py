@@ -27,6 +27,7 @@ class Session:
         first_time_s: Time of that frame.
         frames: Frames seen.
         began: Why it is a session of its own: ``start``, ``carried`` or ``gap``.
+        continues: Session that it goes on from, where it was carried or after a gap; else 0.
     """
 
     id: int
@@ -37,6 +38,7 @@ class Session:
     first_time_s: float = 0.0
     frames: int = 0
     began: str = "start"
+    continues: int = 0
 
     @property
     def name(self) -> str:
@@ -92,6 +94,15 @@ class SessionLog(Population):
     def now(self) -> Session:
         """The session that goes on."""
         return self.sessions[-1]
+
+    def this_drive(self) -> set[str]:
+        """Return the names of the session that goes on and of those that it continues."""
+        before = {session.id: session.continues for session in self.sessions}
+        drive, session = set(), self.now.id
+        while session:
+            drive.add(session_name(session))
+            session = before.get(session, 0)
+        return drive
 
     @staticmethod
     def merged(loaded: State, partial: State, _join: Join) -> State:
