@@ -172,6 +172,8 @@ def run(
     paths = tuple(_absolute(brain_file(path)) for path in maps)
     plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths)
     require_free(out, plan.source, overwrite)
+    if any(Path(path).parent == out.resolve() for path in paths):
+        raise RunError(f"{out}: holds the stored map, which would be lost; take another folder")
     stored = [load_brain(path) for path in paths]  # first: nothing is written if it fails
     config = config or (stored[0].config if stored else BrainConfig())
     opened = open_source(source, config.frame_rate_hz)

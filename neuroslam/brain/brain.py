@@ -94,7 +94,7 @@ class NavigationBrain(nn.Module):
 
     def populations(self) -> dict[str, Population]:
         """Return the parts that its state is made of, by name."""
-        return {name: part for name, part in self.named_children() if name != "stored"}
+        return {n: part for n, part in self.named_children() if isinstance(part, Population)}
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:

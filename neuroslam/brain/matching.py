@@ -141,7 +141,7 @@ def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Fou
         return None
     one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
     pixels = [
-        brain.view.templates["pixels"].numpy()[brain.map.experiences["template"].numpy()[o.experience]]
+        brain.view.templates["pixels"].numpy(force=True)[brain.map.experiences["template"].numpy()[o.experience]]
         for brain, o in ((loaded, one), (partial, other))
     ]  # fmt: skip
     aliased = (np.isin(keys[0][i], origin_key(_aliases(loaded.map)))

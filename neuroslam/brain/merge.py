@@ -331,11 +331,14 @@ def merge(
             f"views or pose cells were made with different configs: {'; '.join(differing)}"
         )
         return None, report
-    state, join = merge_states(
-        loaded.state_dict(), partial.state_dict(), match, partial.config, partial.populations()
-    )
+    states = [
+        {name: value.cpu() for name, value in brain.state_dict().items()}
+        for brain in (loaded, partial)
+    ]
+    state, join = merge_states(*states, match, partial.config, partial.populations())
     merged = type(partial)(partial.config)
     merged.take(state, [*map(deepcopy, loaded.stored), *map(deepcopy, partial.stored)])
+    merged.to(partial.pose_cells.window.device)
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded, partial, merged, join)
     if strain > allowed:

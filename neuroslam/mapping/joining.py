@@ -28,8 +28,9 @@ def merge_maps(loaded: State, partial: State, join: Join) -> State:
     pose = join.place(old["experiences.pose"])
     pose[:, 2] = wrap_angles(pose[:, 2] - join.turns_rad)
     cell = join.experience_cells.copy()
-    turned = join.turns_rad * join.torus[2] / TWO_PI
-    cell[:, 2] = (cell[:, 2] - turned) % join.torus[2]
+    n_theta = join.torus[2]
+    turned = (cell[:, 2] - join.turns_rad * n_theta / TWO_PI) % n_theta
+    cell[:, 2] = np.where(turned >= n_theta, 0.0, turned)  # a tiny negative rounds up to n
     moved = {
         "pose": pose[kept],
         "cell": cell[kept],
