@@ -25,6 +25,10 @@ _REST_LOOPS = 5000
 """Most loops in which the merged map is relaxed; a large map goes on relaxing when it is used."""
 
 
+_ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
+"""The files of a run that have a row a frame, and what they are without any."""
+
+
 def join_brains(
     loaded: NavigationBrain, partial: NavigationBrain
 ) -> tuple[NavigationBrain | None, list[MergeReport]]:
@@ -120,6 +124,9 @@ def merge_runs(
         require_free(out, str(file.resolve()), overwrite)
         if file.resolve().parent == out.resolve():
             raise RunError(f"{out}: holds one of the two maps; take another folder")
+    for name in _ROWS:
+        if Path(second).is_dir() and not (Path(second) / name).is_file():
+            raise RunError(f"{Path(second) / name}: missing; give its brain file to merge without")
     loaded, partial = brains
     if confirm is not None:
         sessions = partial.config.sessions.model_copy(update={"confirm": confirm})
@@ -143,8 +150,7 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as name:
             beside = Path(name)
-            rows = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
-            for file, empty in rows.items():
+            for file, empty in _ROWS.items():
                 if second.is_dir():
                     shutil.copyfile(second / file, beside / file)
                 else:

@@ -137,7 +137,7 @@ class SessionLog(Population):
 
 
 def _as_bytes(about: dict[str, Any]) -> Tensor:
-    text = json.dumps(about, sort_keys=True).encode()
+    text = json.dumps(about).encode()
     return torch.frombuffer(bytearray(text), dtype=torch.uint8)
 
 
