@@ -180,7 +180,7 @@ def read_trace(
         raise RunError(f"{path}: missing; is {out} a run?")
     values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
     there = len(values) // width
-    if not len(values) and (rows or min_rows):
+    if not path.stat().st_size and (rows or min_rows):
         raise RunError(f"{path}: holds no frames; was it merged from brain files alone?")
     if there < (rows or min_rows):
         raise RunError(f"{path}: damaged, {there} whole rows; expected {rows or 'some'}")

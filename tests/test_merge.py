@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import tempfile
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from neuroslam.population import Population
 from neuroslam.sensors import open_source
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
-few = settings(max_examples=20, deadline=None)
+few = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 turns = st.one_of(st.just(0.0), st.floats(-math.pi, math.pi))
 VIEW = {"template_width": 12, "template_height": 4, "shift_match": 1}
@@ -476,7 +477,7 @@ points = st.lists(st.tuples(axis, axis, axis), min_size=3, max_size=3)
 
 
 @given(points, turns)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_pose_cells_move_by_the_same_way_on_the_torus_also_over_its_seams(ends, turn):
     torus = (21, 21, 36)
     p_u, p_z, p_other = np.minimum(np.array(ends) * torus, np.nextafter(torus, 0.0))
@@ -503,7 +504,7 @@ def test_pose_cells_move_by_the_same_way_on_the_torus_also_over_its_seams(ends, 
 
 
 @given(axis, axis, turns)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_cells_of_places_that_share_the_matched_view_stay_on_the_torus(theta_u, theta_z, turn):
     """Their heading is told by the merged view: turned back by what the match turned them."""
     loaded, partial = synthetic(1, shared=True), synthetic(2, session=2, shared=True)
@@ -670,6 +671,31 @@ def test_three_maps_in_a_chain_become_one_whichever_two_are_joined_first(seed, p
         assert abs(wrap_angle(one[3] - other[3])) < 1e-6
 
 
+@given(seeds, turns, turns)
+@few
+def test_headings_of_a_place_that_was_folded_twice_add_up(seed, rho, sigma):
+    a, b, c = (synthetic(seed + i, session=i + 1) for i in range(3))
+    ab, _ = unchecked(a, b, Match(3, 5, rho))
+    cab, _ = unchecked(c, ab, Match(2, 3, sigma))
+    for name, turned in (((3, 2), 0.0), ((1, 3), sigma), ((2, 5), rho + sigma)):
+        place, turn = now(cab, *name)
+        assert place == 2
+        assert abs(wrap_angle(turn - turned)) < 1e-9
+
+
+@pytest.mark.parametrize("errors", [(0.05, 0.04, 0.01), (0.05, 0.01, 0.04)])
+def test_of_places_with_one_view_the_match_says_what_that_becomes_then_the_most_alike(errors):
+    loaded, partial = synthetic(1, shared=True), synthetic(2, session=2, shared=True)
+    one, two = (0, 9), (4, 10)  # places of the partial map with one view each
+    others = Pairs.of([(two[0], 5, 0.2, errors[1]), (two[1], 6, 0.3, errors[2])])
+    _, join = unchecked(loaded, partial, Match(1, one[0], 0.1, 0.05, others=others))
+    likeliest, turn = (5, 0.2) if errors[1] < errors[2] else (6, 0.3)
+    assert (join.views[4], join.view_turns_rad[4]) == (likeliest, turn)
+    others = Pairs.of([(one[1], 7, 0.4, 0.01)])
+    _, join = unchecked(loaded, partial, Match(1, one[0], 0.1, 0.05, others=others))
+    assert (join.views[0], join.view_turns_rad[0]) == (1, 0.1)
+
+
 @given(seeds, st.booleans())
 @few
 def test_a_brain_merged_with_itself_is_that_brain(seed, panoramic):
@@ -757,9 +783,21 @@ def test_copies_that_went_different_ways_are_told_apart(ellipse):
 # --- refusals -----------------------------------------------------------------------------------
 
 
+def with_drift(brain, drift):
+    sessions = brain.config.sessions.model_copy(update={"drift": drift})
+    brain.config = brain.config.model_copy(update={"sessions": sessions})
+    return brain
+
+
 @pytest.mark.parametrize("far", [0, 44])
-def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(far, ellipse):
-    first, second = lived(ellipse[:150]), lived(ellipse[100:250])
+@pytest.mark.parametrize(
+    ("drift", "said"), [(0.25, "odometry may be off by"), (1.0, "contradicts itself")]
+)
+def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(
+    far, drift, said, ellipse
+):
+    """By odometry, where that is trusted; else by the links that the relaxed map pulls apart."""
+    first, second = lived(ellipse[:150]), with_drift(lived(ellipse[100:250]), drift)
     found = find_match(first, second).match
     before = frozen(first), frozen(second)
     beside = found.partial + 1  # a link away, and said to be a place metres away
@@ -767,12 +805,21 @@ def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(f
     merged, report = merge(first, second, wrong)
     assert merged is None
     assert not report.merged
-    said = report.reason
-    assert "contradicts itself" in said
-    off, allowed = (float(word) for word in said.split() if word.replace(".", "").isdigit())
+    assert said in report.reason
+    numbers = re.findall(r"\d+\.\d+", report.reason)
+    off, allowed = map(float, numbers)
     assert off > allowed > 0.0
-    assert report.residual_after_m > report.residual_before_m
     assert (frozen(first), frozen(second)) == before
+
+
+def test_an_open_arc_is_not_closed_by_one_wrong_pair(ellipse):
+    """The strain of one pair spreads over all links, so that none is torn; odometry knows."""
+    first, second = lived(ellipse[:150]), lived(ellipse[100:250])
+    found = find_match(first, second).match
+    arc = found._replace(others=Pairs.of([(second.map.n - 1, 0, 0.0, 0.01)]))
+    merged, report = merge(first, second, arc)
+    assert merged is None
+    assert "cannot be the same" in report.reason
 
 
 def test_maps_made_with_other_views_or_cells_are_refused_and_the_keys_named():
@@ -832,7 +879,7 @@ motions = st.tuples(far, far, st.floats(-math.pi, math.pi))
 
 
 @given(seeds, motions, motions)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_which_places_agree_does_not_depend_on_how_the_maps_lie(seed, motion, other):
     rng = np.random.default_rng(seed)
     places = drive(seed)
@@ -863,6 +910,15 @@ def test_a_place_seen_with_a_wrong_heading_does_not_agree():
     places = drive(4)
     pairs = Pairs.of([(i, i, 0.0, 0.01) for i in range(4)] + [(5, 5, 1.0, 0.01)])
     assert [g.tolist() for g in agreeing(pairs, places, places, LIMITS)] == [[0, 1, 2, 3], [4]]
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_a_wrong_heading_shows_over_a_long_way_from_whichever_end(wrong):
+    places = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    turned = [0.0, 0.0]
+    turned[wrong] = 0.4  # within turn_rad; over 10 m that is 4 m aside
+    pairs = Pairs.of([(i, i, turned[i], 0.01) for i in range(2)])
+    assert [g.tolist() for g in agreeing(pairs, places, places, LIMITS)] == [[0], [1]]
 
 
 @pytest.mark.parametrize("which", ["partial", "loaded", "both"])

@@ -8,15 +8,10 @@ import torch
 from torch import nn
 
 from neuroslam.brain.continuity import Continuity
+from neuroslam.brain.limits import WINDOW, elsewhere, tolerance
 from neuroslam.brain.matching import shared_history
 from neuroslam.brain.merge import Match, differing_keys, merge
-from neuroslam.brain.recognition import (
-    WINDOW,
-    Recognition,
-    StoredViews,
-    elsewhere,
-    tolerance,
-)
+from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
@@ -265,9 +260,7 @@ class NavigationBrain(nn.Module):
             seen.relative_heading_rad - view.relative_heading_rad,
             seen.error,
         )
-        cells = self.config.pose_cells
-        place_m = cells.create_threshold_cells * cells.cell_size_m
-        limits = tolerance((loaded, self.map), config, place_m, config.confirm)
+        limits = tolerance((loaded, self.map), self.config)
         agreed = recognition.confirmed(where, loaded, self.map, limits)
         if n_places(agreed) < config.confirm:
             return False

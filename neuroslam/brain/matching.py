@@ -3,11 +3,9 @@
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
+from neuroslam.brain.limits import elsewhere, far_off, tolerance
 from neuroslam.brain.merge import Match, differing_keys
-from neuroslam.brain.recognition import elsewhere, tolerance
 from neuroslam.brain.sessions import session_name
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
@@ -61,9 +59,7 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
         return Found(
             None, f"no view of one looks like a view of the other within {threshold:g}{nearest}"
         )
-    cells = partial.config.pose_cells
-    place_m = cells.create_threshold_cells * cells.cell_size_m
-    limits = tolerance((loaded.map, partial.map), partial.config.sessions, place_m, confirm)
+    limits = tolerance((loaded.map, partial.map), partial.config)
     groups = [pairs.pick(g) for g in agreeing(pairs, partial.map.poses, loaded.map.poses, limits)]
     sizes = tuple(n_places(group) for group in groups)
     if sizes[0] < confirm:
@@ -192,23 +188,10 @@ def _fits(
     limits: Tolerance,
 ) -> bool:
     """Could odometry be so wrong on the ways between two groups that both are right?"""
-    end = int(np.argmin(group.error))
-    z, u = partial.poses, loaded.poses
-    turn = u[first.loaded[at], 2] + first.turn_rad[at] - z[first.partial[at], 2]
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = z[group.partial[end], :2] - z[first.partial[at], :2]
-    expected = u[first.loaded[at], :2] + (c * dx - s * dy, s * dx + c * dy)
-    apart = np.linalg.norm(u[group.loaded[end], :2] - expected)
-    way = _way_m(partial, first.partial[at], group.partial[end]) + _way_m(
-        loaded, first.loaded[at], group.loaded[end]
-    )
-    return bool(apart <= limits.place_m + limits.drift * way)
-
-
-def _way_m(of: ExperienceMap, start: int, end: int) -> float:
-    links = of.links
-    graph = coo_array((links.distance_m + 1e-9, (links.source, links.target)), shape=(of.n, of.n))
-    return float(dijkstra(graph.tocsr(), directed=False, indices=int(start))[end])
+    ends = [first.pick([at]), group.pick([int(np.argmin(group.error))])]
+    both = Pairs(*(np.concatenate(columns) for columns in zip(*ends, strict=True)))
+    misfit, allowed = far_off(both, loaded, partial, limits)
+    return bool(misfit[1] <= allowed[1])
 
 
 def _runner_up(

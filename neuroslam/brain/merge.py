@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
+from neuroslam.brain.limits import far_off, tolerance
 from neuroslam.cells.attractor import moved_cells
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
@@ -331,6 +332,9 @@ def merge(
             f"views or pose cells were made with different configs: {'; '.join(differing)}"
         )
         return None, report
+    report.reason = _beyond_odometry(loaded, partial, match)
+    if report.reason:
+        return None, report
     states = [
         {name: value.cpu() for name, value in brain.state_dict().items()}
         for brain in (loaded, partial)
@@ -353,6 +357,23 @@ def merge(
     report.reason = f"{new} places are new" if new else "nothing is new: the place was known"
     merged.sessions.merges.append(report.to_dict())
     return merged, report
+
+
+def _beyond_odometry(loaded: "NavigationBrain", partial: "NavigationBrain", match: Match) -> str:
+    """Say which of the places that are said to be the same odometry cannot have so far apart."""
+    pairs = match.pairs
+    inside = (pairs.loaded < loaded.map.n) & (pairs.partial < partial.map.n)
+    if len(pairs.partial) == 1 or not inside.all():
+        return ""
+    limits = tolerance((loaded.map, partial.map), partial.config)
+    off_m, allowed_m = far_off(pairs, loaded.map, partial.map, limits)
+    worst = int(np.argmax(off_m - allowed_m))
+    if off_m[worst] <= allowed_m[worst]:
+        return ""
+    return (
+        f"places {pairs.partial[worst]} and {pairs.loaded[worst]} cannot be the same: laid on the "
+        f"match they lie {off_m[worst]:.2f} m apart, odometry may be off by {allowed_m[worst]:.2f}"
+    )
 
 
 def _describe(

@@ -1,21 +1,16 @@
 """Is this a place of a stored map? Views say where it looks alike, their order whether it is."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from neuroslam.config import SessionConfig
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
 from neuroslam.population import Join, Population, State
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.templates import LocalViewCells
-
-WINDOW = 3
-"""A match of n places may have passed this many times n others: some views are missed."""
 
 
 class StoredViews:
@@ -52,28 +47,6 @@ class StoredViews:
         """Return the smallest difference to any template but those ``near`` of map ``where``."""
         rest = np.setdiff1d(np.arange(self.joined.n), self.starts[where] + near)
         return min(self.joined.differences(view, rest), default=None)
-
-
-def elsewhere(of: ExperienceMap, experience: int, limits: Tolerance) -> np.ndarray:
-    """Tell which experiences are too far from one to look like it because they are near."""
-    poses = of.poses
-    apart = np.linalg.norm((poses - poses[experience])[:, :2], axis=1)
-    return apart > limits.near_m / (2.0 * WINDOW)
-
-
-def tolerance(
-    maps: Sequence[ExperienceMap], config: SessionConfig, place_m: float, confirm: int
-) -> Tolerance:
-    """Set what still agrees, in the scale of the maps: the usual way between two places."""
-    lengths = np.concatenate([one.links.distance_m for one in maps])
-    spacing_m = float(np.median(lengths)) if len(lengths) else place_m
-    elsewhere_m = confirm * max(spacing_m, place_m)
-    return Tolerance(
-        near_m=2.0 * elsewhere_m * WINDOW,
-        place_m=place_m,
-        drift=config.drift,
-        turn_rad=math.radians(config.turn_tolerance_deg),
-    )
 
 
 class Recognition(Population):

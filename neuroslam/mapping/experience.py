@@ -11,7 +11,7 @@ from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.least_squares import solve_pose_graph
-from neuroslam.mapping.planning import Plan, quickest_path
+from neuroslam.mapping.planning import Plan, quickest_path, shortest_ways
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.mapping.tables import (
     ALIAS_COLUMNS,
@@ -330,6 +330,10 @@ class ExperienceMap(Population):
         here = self.pose
         dx, dy = x - here.x_m, y - here.y_m
         return math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - here.theta_rad)
+
+    def ways_m(self, start: int) -> np.ndarray:
+        """Return the length of the shortest way over links to every experience, in m, ``(n,)``."""
+        return shortest_ways(self.links, self.n, start)
 
     def plan(self, goal: int, start: int | None = None) -> Plan:
         """Find the quickest way to an experience by the time its links took, in both directions.

@@ -112,6 +112,25 @@ def agreeing(
     return sorted(groups, key=lambda group: (-n_places(pairs.pick(group)), group[0]))
 
 
+def misfits_m(pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray) -> np.ndarray:
+    """Lay one map on the other by the first pair; how far apart do the places of each pair lie?
+
+    Args:
+        pairs: At least one.
+        partial_poses: x, y in metres and heading in radians, ``(n, 3)``.
+        loaded_poses: The same of the loaded map, ``(m, 3)``.
+
+    Example:
+        >>> line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+        >>> misfits_m(Pairs.of([(0, 0, 0, 0), (1, 2, 0, 0)]), line, line).tolist()
+        [0.0, 1.0]
+    """
+    z, u = partial_poses[pairs.partial], loaded_poses[pairs.loaded]
+    facing = np.full(len(z), u[0, 2] + pairs.turn_rad[0])
+    there = _seen_from(z[:1], np.full(len(z), z[0, 2]), z)
+    return np.linalg.norm(there - _seen_from(u[:1], facing, u), axis=1)
+
+
 def n_places(pairs: Pairs) -> int:
     """Count the places of which both maps have another: standing still confirms nothing."""
     return min(len(np.unique(pairs.partial)), len(np.unique(pairs.loaded)))

@@ -1,9 +1,9 @@
-"""The quickest way through a map."""
+"""The quickest and the shortest ways through a map."""
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 
@@ -42,15 +42,7 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
     for name, experience in (("start", start), ("goal", goal)):
         if not 0 <= experience < n:
             return Plan([], np.inf, f"{name} {experience} is not in a map of {n} experiences")
-    source, target, duration = links[0], links[1], links[-1]
-    # csgraph takes a stored 0 for no edge, and coo sums duplicates: keep the quickest of each pair.
-    pairs = np.concatenate([source * n + target, target * n + source])
-    seconds = np.maximum(np.concatenate([duration, duration]), 1e-9)
-    order = np.lexsort((seconds, pairs))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = np.diff(pairs[order]) != 0
-    pairs, seconds = pairs[order][first], seconds[order][first]
-    graph = coo_array((seconds, (pairs // n, pairs % n)), shape=(n, n)).tocsr()
+    graph = _graph(links[0], links[1], links[-1], n)
     distance, before = dijkstra(graph, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
         return Plan([], np.inf, f"no links lead from experience {start} to {goal}")
@@ -58,3 +50,33 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
     while path[-1] != start:
         path.append(int(before[path[-1]]))
     return Plan(path[::-1], float(distance[goal]))
+
+
+def shortest_ways(links: tuple[np.ndarray, ...], n: int, start: int) -> np.ndarray:
+    """Find how far it is to every experience over links, in both directions (Dijkstra).
+
+    Args:
+        links: ``source``, ``target``, ``distance_m``, ..., as for :func:`quickest_path`.
+        n: Number of experiences.
+        start: Id to start from.
+
+    Returns:
+        Metres, ``(n,)``; infinite where no links lead.
+
+    Example:
+        >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
+        >>> shortest_ways(links, 3, 2).tolist()
+        [6.0, 1.0, 0.0]
+    """
+    return dijkstra(_graph(*links[:3], n), indices=start)
+
+
+def _graph(source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int) -> csr_array:
+    """Both directions of every link; csgraph takes a stored 0 for no edge, so none is 0."""
+    pairs = np.concatenate([source * n + target, target * n + source])
+    weights = np.maximum(np.concatenate([weight, weight]), 1e-9)
+    order = np.lexsort((weights, pairs))  # coo sums duplicates: keep the least of each pair
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(pairs[order]) != 0
+    pairs, weights = pairs[order][first], weights[order][first]
+    return coo_array((weights, (pairs // n, pairs % n)), shape=(n, n)).tocsr()
