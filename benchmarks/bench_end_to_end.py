@@ -37,6 +37,7 @@ def brain_that_knows(n: int) -> NavigationBrain:
         odometry={"use": "given"},
         view={"shift_match": 5, "normalisation": 0.0},
         pose_cells={"inject_after": 0},
+        sessions={"carried": "ignore"},  # from stretch to stretch of these places the view jumps
     )
     brain = NavigationBrain(config)
     known = memory(places(n), config.view)
@@ -49,7 +50,9 @@ def brain_that_knows(n: int) -> NavigationBrain:
     poses = torch.zeros(n, 3, dtype=torch.float64)
     poses[:, 0] = torch.arange(n) * SPACING_M
     ids = torch.arange(n)
-    brain.map.experiences.replace(pose=poses, cell=cells, template=ids, first_frame=ids)
+    brain.map.experiences.replace(
+        pose=poses, cell=cells, template=ids, first_frame=ids, session=0 * ids, number=ids
+    )
     one = torch.ones(n - 1, dtype=torch.float64)
     brain.map.links_table.replace(
         source=ids[:-1], target=ids[1:], distance_m=SPACING_M * one, heading_rad=0 * one,

@@ -1,10 +1,13 @@
 """Fixtures that several test files share."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import pytest
 import torch
+
+from neuroslam.cli import main
 
 torch.set_num_threads(1)
 cv2.setNumThreads(1)
@@ -17,3 +20,32 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip("no ../shared beside the checkout: real data and references are kept there")
     return folder
+
+
+@pytest.fixture
+def call(capsys):
+    """Call the command line: its exit code, what it printed and what it complained of."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in out + err
+        return SimpleNamespace(code=code, out=out, err=err)
+
+    return run
+
+
+@pytest.fixture
+def mistake(call):
+    """Call the command line with a mistake in it: the one line that it says."""
+
+    def run(*arguments) -> str:
+        done = call(*arguments)
+        assert done.code == 2
+        assert done.err.endswith("\n")
+        assert done.err.count("\n") == 1, done.err
+        assert done.err.startswith(f"neuroslam {arguments[0]}: ")
+        return done.err
+
+    return run

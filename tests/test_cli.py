@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -28,35 +27,6 @@ def contents(folder) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-
-
-@pytest.fixture
-def call(capsys):
-    """Call the command line: its exit code, what it printed and what it complained of."""
-
-    def run(*arguments):
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in out + err
-        return SimpleNamespace(code=code, out=out, err=err)
-
-    return run
-
-
-@pytest.fixture
-def mistake(call):
-    """Call the command line with a mistake in it: the one line that it says."""
-
-    def run(*arguments) -> str:
-        done = call(*arguments)
-        assert done.code == 2
-        assert done.err.endswith("\n")
-        assert done.err.count("\n") == 1, done.err
-        assert done.err.startswith(f"neuroslam {arguments[0]}: ")
-        return done.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -40,34 +39,6 @@ def rows(path) -> list[dict[str, str]]:
 
 def sizes(brain):
     return brain.view.n, brain.map.n, brain.map.n_links
-
-
-@pytest.fixture
-def call(capsys):
-    """Call the command line: its exit code, what it printed and what it complained of."""
-
-    def command(*arguments):
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in out + err
-        return SimpleNamespace(code=code, out=out, err=err)
-
-    return command
-
-
-@pytest.fixture
-def mistake(call):
-    """Call the command line with a mistake in it: the one line that it says."""
-
-    def command(*arguments) -> str:
-        done = call(*arguments)
-        assert done.code == 2
-        assert done.err.count("\n") == 1, done.err
-        assert done.err.startswith(f"neuroslam {arguments[0]}: ")
-        return done.err
-
-    return command
 
 
 @pytest.fixture(scope="module")
