@@ -225,7 +225,7 @@ class NavigationBrain(nn.Module):
             Session(
                 session_id(
                     self.config.model_dump_json(),
-                    *self.about,
+                    self.about[0],
                     [session.id for one in self.stored for session in one.sessions.sessions],
                     frame.index,
                     float(frame.time_s),
