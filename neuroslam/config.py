@@ -5,181 +5,26 @@ import difflib
 import math
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError
 
 from neuroslam.errors import ConfigError
-
-Region = tuple[int, int, int, int]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class OdometryConfig(_Section):
-    """Visual odometry: two image regions, matched with their predecessors."""
-
-    use: Literal["auto", "visual", "given"] = Field(
-        "auto", description="auto: the source's own odometry where it has one, else visual"
-    )
-    speed_region: Region | None = Field(
-        None, description="x_min, x_max, y_min, y_max in px; none: lower half of the picture"
-    )
-    turn_region: Region | None = Field(
-        None, description="x_min, x_max, y_min, y_max in px; none: upper half of the picture"
-    )
-    max_shift_px: int = Field(40, ge=1, description="largest offset tried; larger: faster turns")
-    fov_deg: float = Field(90.0, gt=0, le=360, description="horizontal view of the whole picture")
-    speed_scaling_m_s: float = Field(
-        100.0, gt=0, description="speed per unit of profile difference; larger: longer map"
-    )
-    max_speed_m_s: float = Field(5.0, gt=0, description="speeds are cut here")
-    min_speed_m_s: float = Field(0.02, ge=0, description="below it the robot stands still")
-    first_frame: Literal["still", "zero_profile"] = Field(
-        "still", description="zero_profile: compared with an all-zero profile, as OpenRatSLAM does"
-    )
+from neuroslam.sections import (
+    BoundaryCellConfig,
+    GridCellConfig,
+    MapConfig,
+    OdometryConfig,
+    PlaceCellConfig,
+    PoseCellConfig,
+    Section,
+    SessionConfig,
+    ViewConfig,
+    WallMemoryConfig,
+)
 
 
-class ViewConfig(_Section):
-    """Local view cells: how a picture becomes a template and when two are the same place."""
-
-    crop: Region | None = Field(None, description="x_min, x_max, y_min, y_max in px; none: all")
-    template_width: int = Field(60, ge=2, description="px; larger: tells more places apart")
-    template_height: int = Field(10, ge=1, description="px")
-    threshold: float = Field(
-        0.05, gt=0, lt=1, description="largest mean difference that is a match; larger: fewer views"
-    )
-    shift_match: int = Field(4, ge=0, description="columns a forward view may be shifted by")
-    shift_step: int = Field(1, ge=1, description="columns between two shifts that are tried")
-    panoramic: bool = Field(False, description="roll through the full turn, report the heading")
-    normalisation: float = Field(0.5, ge=0, le=1, description="mean grey to scale to; 0: off")
-    patch_radius: int = Field(0, ge=0, description="patch normalisation over +-k px; 0: off")
-    patch_min_std: float = Field(0.0, ge=0, description="flatter patches become 0.5")
-    min_contrast: float = Field(
-        0.01, ge=0, lt=1, description="std of grey below which a frame shows nothing; 0: off"
-    )
-    mean_gate: bool = Field(
-        False, description="skip templates whose mean differs by more than threshold + 0.005"
-    )
-    precision: Literal["uint8", "float64"] = Field(
-        "uint8", description="how a template is kept: one byte a pixel, or eight"
-    )
-
-    @model_validator(mode="after")
-    def _shift_leaves_columns(self) -> Self:
-        if not self.panoramic and 2 * self.shift_match >= self.template_width:
-            raise ValueError(
-                f"shift_match {self.shift_match} leaves no column of template_width "
-                f"{self.template_width}; it must be below half of it"
-            )
-        return self
-
-
-class PoseCellConfig(_Section):
-    """Pose cells: a continuous attractor on the torus ``(n_theta, n_xy, n_xy)``."""
-
-    n_xy: int = Field(21, ge=7, description="cells a side; it goes round, so it bounds no map")
-    n_theta: int = Field(36, ge=7, description="cells in a full turn")
-    cell_size_m: float = Field(0.25, gt=0, description="side of a cell; larger: coarser places")
-    excite_size: int = Field(7, ge=1, description="odd width of the excitation kernel, cells")
-    excite_std_xy: float = Field(1.0, gt=0, description="cells; wider: a broader packet")
-    excite_std_theta: float = Field(1.0, gt=0, description="cells, of heading")
-    inhibit_size: int = Field(5, ge=1, description="odd width of the inhibition kernel, cells")
-    inhibit_std_xy: float = Field(2.0, gt=0, description="cells")
-    inhibit_std_theta: float = Field(2.0, gt=0, description="cells, of heading")
-    global_inhibition: float = Field(2e-5, ge=0, description="activity taken from every cell")
-    inject_energy: float = Field(
-        0.2, ge=0, description="activity a known view adds; larger: quicker relocalisation"
-    )
-    active_decay: float = Field(
-        1.0, ge=0, description="fatigue added each time the same view is seen in a row"
-    )
-    restore: float = Field(0.05, ge=0, description="fatigue every view loses each frame")
-    inject_after: int = Field(10, ge=0, description="the newest so many views inject nothing")
-    inject_while_few: bool = Field(
-        False,
-        description="inject always while there are fewer views than that, as OpenRatSLAM does",
-    )
-    inject_at_cell: bool = Field(
-        False, description="inject at the cell below the bound pose, as OpenRatSLAM does"
-    )
-    exact_gain: bool = Field(
-        True, description="make up for the pull of settling; off: the packet lags, as OpenRatSLAM's"
-    )
-    create_threshold_cells: float = Field(
-        2.0, gt=0, description="farther than this from a known place is a new one"
-    )
-    decode_radius: int = Field(3, ge=0, description="cells around the peak that are averaged")
-    precision: Literal["float32", "float64"] = Field("float32", description="of the activity")
-
-    @model_validator(mode="after")
-    def _kernels_fit(self) -> Self:
-        for name in ("excite_size", "inhibit_size"):
-            size = getattr(self, name)
-            if size % 2 == 0:
-                raise ValueError(f"{name} is {size}, must be odd: a kernel has a centre")
-            if size > min(self.n_xy, self.n_theta):
-                raise ValueError(f"{name} {size} is wider than the torus")
-        return self
-
-
-class MapConfig(_Section):
-    """Experience map: a graph of places, relaxed until its links agree."""
-
-    initial_heading_deg: float = Field(90.0, description="heading of the robot at the start")
-    solver: Literal["relax", "least_squares"] = Field(
-        "relax", description="relax: the paper's Eq. 8; least_squares: sparse pose graph"
-    )
-    correction: float = Field(
-        0.5, gt=0, le=0.5, description="share of its error by which a link moves each of its ends"
-    )
-    loops: int = Field(20, ge=0, description="relaxation loops a frame, while not at rest")
-    rest_tolerance: float = Field(
-        1e-6, ge=0, description="largest correction (m, rad) of a map at rest"
-    )
-    sigma_m: float = Field(0.1, gt=0, description="least_squares: how far a link may be off")
-    sigma_rad: float = Field(0.1, gt=0, description="least_squares: and its facing")
-    robust: bool = Field(
-        False, description="least_squares: loops that contradict the others lose their weight"
-    )
-
-
-class SessionConfig(_Section):
-    """How sure a brain must be before it joins its map to a stored one."""
-
-    confirm: int = Field(
-        4, ge=1, description="places that must agree on how the maps lie; 1: the first view decides"
-    )
-    drift: float = Field(
-        0.25, ge=0, le=1, description="share of the way between them by which they may disagree"
-    )
-    turn_tolerance_deg: float = Field(
-        30.0, gt=0, le=180, description="and by which the turns between them may"
-    )
-    cells: Literal["turn", "shift", "none"] = Field(
-        "turn",
-        description="how pose-cell states of a joined map move: shifted and turned; only shifted, "
-        "as the paper; not at all",
-    )
-    carried: Literal["detect", "ignore"] = Field(
-        "detect",
-        description="a robot that suddenly sees something else was carried: it goes on with a new "
-        "map, which is joined to the old one when that is recognised",
-    )
-    carried_factor: float = Field(
-        3.5, gt=1, description="suddenly: the view changes by so many times what it usually does"
-    )
-    after_gap: Literal["stop", "new_map"] = Field(
-        "stop", description="after a gap longer than max_gap_s: an error, or go on with a new map"
-    )
-    residual_factor: float = Field(
-        2.0, ge=1, description="links may be off by so many times what they were; more: refused"
-    )
-
-
-class BrainConfig(_Section):
+class BrainConfig(Section):
     """Which cell populations a brain has, and every number in them.
 
     Example:
@@ -192,6 +37,15 @@ class BrainConfig(_Section):
     pose_cells: PoseCellConfig = PoseCellConfig()
     map: MapConfig = MapConfig()
     sessions: SessionConfig = SessionConfig()
+    boundary_cells: BoundaryCellConfig = BoundaryCellConfig()
+    grid_cells: GridCellConfig = GridCellConfig()
+    place_cells: PlaceCellConfig = PlaceCellConfig()
+    wall_memory: WallMemoryConfig = WallMemoryConfig()
+    cells: Literal["pose", "place", "pose_and_place"] = Field(
+        "pose",
+        description="pose: views, pose cells and map (RatSLAM); place: boundary, grid and place "
+        "cells (SLRB); or both on the same frames",
+    )
     frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
     threads: int = Field(1, ge=1, description="of a run; for one brain, one is the fastest")
     max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")

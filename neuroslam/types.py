@@ -42,7 +42,11 @@ class Frame(NamedTuple):
         time_s: Time of the frame in seconds; rises strictly from frame to frame.
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
         velocity: Measured self-motion over the interval that ends at this frame.
-        ranges: Distances in metres, any shape the consumer expects.
+        ranges: Distances in metres, ``(n,)``, at bearings evenly over the full turn,
+            counter-clockwise from straight ahead; ``inf`` where nothing is in reach.
+        walls: Distance (m) and bearing (rad, relative to the heading) of the foot of the
+            perpendicular on each wall seen, ``(n, 2)``.
+        heading_rad: Heading measured by a compass, in the world.
         landmarks: Whatever landmark observations the source has, as an array.
         truth: True pose, where the source knows it. Never used by the brain, only by evaluation.
     """
@@ -52,6 +56,8 @@ class Frame(NamedTuple):
     image: np.ndarray | None = None
     velocity: Velocity | None = None
     ranges: np.ndarray | None = None
+    walls: np.ndarray | None = None
+    heading_rad: float | None = None
     landmarks: np.ndarray | None = None
     truth: Pose | None = None
 

@@ -8,9 +8,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 FLOW = [
-    "errors", "types", "geometry", "config", "storage", "population", "vision",
+    "errors", "types", "geometry", "sections", "config", "storage", "population", "vision",
     "sensors", "odometry", "view", "cells", "mapping", "brain",
-    "evaluation", "drawing", "plotting", "merge_drawing", "recording", "run_files",
+    "evaluation", "drawing", "plotting", "cell_drawing", "merge_drawing", "recording", "run_files",
     "inspection", "export",
     "review", "runs", "merging", "demo",
     "experiments", "cli",

@@ -18,7 +18,7 @@ from neuroslam.geometry import integrate_velocities
 from neuroslam.sensors import open_source
 from neuroslam.sensors.images import decode_grey, natural_key, parse_image_list
 from neuroslam.sensors.tracks import motion_along
-from neuroslam.types import Pose, Velocity
+from neuroslam.types import Frame, Pose, Velocity
 
 W, H = 32, 24
 
@@ -345,7 +345,7 @@ def test_the_references_motion_is_read_to_the_last_digit(shared):
     frames = list(source)
     assert source.n_frames == len(frames) == 2873
     assert frames[0].velocity == Velocity(5.0, -9.3593281138195916)
-    assert frames[1] == (1, 0.05, None, Velocity(0.24733893557422978, 0.0), None, None, None)
+    assert frames[1] == Frame(1, 0.05, velocity=Velocity(0.24733893557422978, 0.0))
 
 
 def test_a_motion_table_may_hold_times_truth_and_columns_of_no_meaning_here(tmp_path):
@@ -354,8 +354,8 @@ def test_a_motion_table_may_hold_times_truth_and_columns_of_no_meaning_here(tmp_
         "frame, V_m_s ,w_rad_s,time_s,x_m,y_m,theta_rad\n0,1,2,0.5,3,4,5\n\n1,6,7,0.75,,,\n"
     )
     first, second = open_source(path)
-    assert first == (0, 0.5, None, Velocity(1, 2), None, None, Pose(3, 4, 5))
-    assert second == (1, 0.75, None, Velocity(6, 7), None, None, None)
+    assert first == Frame(0, 0.5, velocity=Velocity(1, 2), truth=Pose(3, 4, 5))
+    assert second == Frame(1, 0.75, velocity=Velocity(6, 7))
 
 
 def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_path):

@@ -228,3 +228,29 @@ def widen(packet: Packet, cell: tuple[int, int, int], width: int = 2) -> Packet:
     if not any(pads):
         return packet
     return Packet(F.pad(packet.values, pads), tuple(origin), packet.shape)
+
+
+def fourier_convolve(activity: Tensor, transfer: Tensor) -> Tensor:
+    r"""Convolve populations on a torus, each with its own kernel, and add up what arrives.
+
+    .. math:: h = \mathcal F^{-1} \sum_d \hat w_d \, \mathcal F r_d
+
+    The way for kernels as wide as the torus, or shifted by fractions of a cell; those of
+    :func:`circular_convolve` are narrow and centred on a cell.
+
+    Args:
+        activity: :math:`r_d`, shape ``(..., populations, n_y, n_x)``.
+        transfer: :math:`\hat w_d`, ``torch.fft.rfft2`` of the kernels, shape
+            ``(populations, n_y, n_x // 2 + 1)``.
+
+    Returns:
+        Shape ``(..., n_y, n_x)``.
+
+    Example:
+        >>> one = torch.zeros(1, 4, 4, dtype=torch.float64); one[0, 3, 0] = 1.0
+        >>> down = torch.zeros(1, 4, 4, dtype=torch.float64); down[0, 1, 0] = 2.0
+        >>> fourier_convolve(one, torch.fft.rfft2(down))[0, 0].item()
+        2.0
+    """
+    arrived = (torch.fft.rfft2(activity) * transfer).sum(-3)
+    return torch.fft.irfft2(arrived, s=activity.shape[-2:])

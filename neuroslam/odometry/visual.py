@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.config import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.population import Running
+from neuroslam.sections import OdometryConfig, Region
 from neuroslam.storage import Scalars
 from neuroslam.types import Velocity
 

@@ -13,8 +13,11 @@ from neuroslam.sensors.images import (
     open_tar,
     read_text,
 )
+from neuroslam.sensors.rodent import ARENA_KEYS, read_walk
+from neuroslam.sensors.senses import ArenaSource, open_arena
 from neuroslam.sensors.source import Source
-from neuroslam.sensors.tracks import TrackSource, parse_motion, read_track
+from neuroslam.sensors.streams import Streams
+from neuroslam.sensors.tracks import TrackSource, parse_motion, read_positions, read_track
 from neuroslam.sensors.video import VIDEO_SUFFIXES, VideoSource
 
 DEFAULT_FRAME_RATE_HZ = 20.0
@@ -22,8 +25,9 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of pictures, an image list or motion CSV, an .npz or .npy track, "
-    "or world:NAME"
+    "world:NAME, arena:NAME, or a camera and motion as drive.avi+motion.csv"
 )
+_MADE = ("world:", "arena:")
 
 
 def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
@@ -35,8 +39,12 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     ``frames.tar.gz``                   (:mod:`neuroslam.sensors.images`)
     ``list.txt``, ``list.csv``          image list (:mod:`neuroslam.sensors.images`)
     ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
-    ``rat.npz``, ``path.npy``           positions (:mod:`neuroslam.sensors.tracks`)
+    ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
+    ``rat.npz`` with an arena in it     the same, and its walls (:mod:`neuroslam.sensors.rodent`)
     ``world:NAME``                      a world rendered on the fly
+    ``arena:NAME``, ``arena:rat.npz``   a walk sensed with noise (:mod:`neuroslam.sensors.senses`)
+    ``drive.avi+motion.csv``            two of these merged by time: a camera, and motion
+                                        (:mod:`neuroslam.sensors.streams`)
     ==================================  ========================================================
 
     Args:
@@ -54,19 +62,58 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     rate = DEFAULT_FRAME_RATE_HZ if frame_rate_hz is None else frame_rate_hz
     if not (math.isfinite(rate) and rate > 0):
         raise SourceError(f"{spec}: frame rate is {rate} Hz; expected a number above 0")
-    if isinstance(spec, str) and spec.startswith("world:"):
-        from neuroslam.sensors.world import open_world  # only who renders pays for its import
-
-        return open_world(spec)
     if spec == "":  # as a path it would be the working folder
         raise SourceError(f"the source has an empty name; expected {_KINDS}")
-    path = Path(spec)
     try:
+        if parts := _parts(str(spec)):
+            return Streams(*(open_source(part, frame_rate_hz) for part in parts))
+        if isinstance(spec, str) and spec.startswith("world:"):
+            from neuroslam.sensors.world import open_world  # only who renders pays for its import
+
+            return open_world(spec)
+        if isinstance(spec, str) and spec.startswith("arena:"):
+            return open_arena(spec)
+        path = Path(spec)
         if not path.exists():
             raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
         return _opener(path)(path, rate)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise SourceError(f"{spec}: cannot be read ({error.strerror or error})") from None
+
+
+def absolute_spec(spec: str) -> str:
+    """Return what names the same source from any working folder.
+
+    Example:
+        >>> absolute_spec("world:town?laps=2"), absolute_spec("arena:square")
+        ('world:town?laps=2', 'arena:square')
+    """
+    if parts := _parts(spec):
+        return "+".join(map(absolute_spec, parts))
+    if spec.startswith("arena:"):
+        name, mark, query = spec.removeprefix("arena:").partition("?")
+        name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
+        return f"arena:{name}{mark}{query}"
+    return spec if spec.startswith(_MADE) else str(Path(spec).resolve())
+
+
+def _parts(spec: str) -> tuple[str, str] | None:
+    """Split ``camera+motion``, where no file has that whole name and each part names something."""
+    if "+" not in spec or Path(spec).exists():
+        return None
+    splits = [(spec[:at], spec[at + 1 :]) for at, letter in enumerate(spec) if letter == "+"]
+    for parts in splits:
+        if all(part.startswith(_MADE) or _exists(part) for part in parts):
+            return parts
+    for parts in splits:
+        for part, other in (parts, parts[::-1]):
+            if _exists(part):
+                raise SourceError(f"{spec}: {part} is there, {other!r} is not; expected {_KINDS}")
+    return None
+
+
+def _exists(part: str) -> bool:
+    return part != "" and Path(part).exists()
 
 
 def _opener(path: Path) -> Callable[[Path, float], Source]:
@@ -80,7 +127,7 @@ def _opener(path: Path) -> Callable[[Path, float], Source]:
     if name.endswith((".csv", ".txt", ".lst")):
         return _open_table
     if name.endswith((".npz", ".npy")):
-        return lambda path, rate: TrackSource(read_track(path, rate), rate)
+        return _open_positions
     what = "is a single picture" if is_picture(name) else "is of no known kind"
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
 
@@ -92,3 +139,10 @@ def _open_table(path: Path, frame_rate_hz: float) -> Source:
         if any(is_picture(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
+
+
+def _open_positions(path: Path, frame_rate_hz: float) -> Source:
+    """Open a track, with its walls if it has an arena."""
+    if any(key in read_positions(path)[0] for key in ARENA_KEYS):
+        return ArenaSource(read_walk(path))
+    return TrackSource(read_track(path, frame_rate_hz), frame_rate_hz)

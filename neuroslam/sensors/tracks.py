@@ -146,22 +146,59 @@ def parse_motion(text: str, name: str) -> Track:
         >>> parse_motion("vtrans,vrot\n0.5,0.1\n", "walk.csv").velocity(0)
         Velocity(v_m_s=0.5, w_rad_s=0.1)
     """
+    table, rows = parse_table(text, name, _MOTION, _EXPECTED, optional=("time_s",), whole=_TRUTH)
+    return Track(
+        name,
+        np.column_stack([table[field] for field in _MOTION]),
+        table.get("time_s"),
+        np.column_stack([table[field] for field in _TRUTH]) if _TRUTH[0] in table else None,
+        rows,
+    )
+
+
+def parse_table(
+    text: str,
+    name: str,
+    needed: Sequence[str],
+    expected: str,
+    optional: Sequence[str] = (),
+    whole: Sequence[str] = (),
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    r"""Read the numbers of a CSV that has a header; an empty field is NaN.
+
+    Args:
+        text: What the file holds.
+        name: The file, for messages.
+        needed: Columns it must have.
+        expected: What to say it should have had.
+        optional: Columns it may have.
+        whole: Columns of which it has all or none.
+
+    Returns:
+        The columns, each ``(n,)``; how each row is called in messages.
+
+    Raises:
+        SourceError: If it is empty, lacks a column, or a line does not fit the header.
+
+    Example:
+        >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "")[0]["y_m"]
+        array([ 2., nan])
+    """
     reader = csv.reader(io.StringIO(text))
     numbered = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
     if not numbered:
-        raise SourceError(f"{name}: is empty; {_EXPECTED}, and a line for each frame")
+        raise SourceError(f"{name}: is empty; {expected}, and a line for each frame")
     header = [field.strip().lower() for field in numbered[0][1]]
     columns = [_ALIASES.get(field, field) for field in header]
-    some_truth = any(field in columns for field in _TRUTH)
-    needed = _MOTION + (_TRUTH if some_truth else ())
+    needed = [*needed, *(whole if any(field in columns for field in whole) else ())]
     missing = [field for field in needed if field not in columns]
     if missing:
         raise SourceError(
-            f"{name}: has the columns {','.join(header)[:100]} and no {missing[0]}; {_EXPECTED}"
+            f"{name}: has the columns {','.join(header)[:100]} and no {missing[0]}; {expected}"
         )
     if len(numbered) == 1:
         raise SourceError(f"{name}: has a header and no lines after it; expected one a frame")
-    wanted = [field for field in ("time_s", *needed) if field in columns]
+    wanted = [*(field for field in optional if field in columns), *needed]
     places = [columns.index(field) for field in wanted]
     values = np.empty((len(numbered) - 1, len(wanted)))
     for out, (line, row) in zip(values, numbered[1:], strict=True):
@@ -169,14 +206,8 @@ def parse_motion(text: str, name: str) -> Track:
             raise SourceError(f"{name}: line {line} has {len(row)} values; expected {len(columns)}")
         for at, place in enumerate(places):
             out[at] = _number(row[place], name, line, wanted[at])
-    table = dict(zip(wanted, values.T, strict=True))
-    return Track(
-        name,
-        np.column_stack([table[field] for field in _MOTION]),
-        table.get("time_s"),
-        np.column_stack([table[field] for field in _TRUTH]) if some_truth else None,
-        [f"line {line}" for line, _ in numbered[1:]],
-    )
+    rows = [f"line {line}" for line, _ in numbered[1:]]
+    return dict(zip(wanted, values.T, strict=True)), rows
 
 
 def _number(text: str, name: str, line: int, column: str) -> float:
@@ -190,6 +221,24 @@ def _number(text: str, name: str, line: int, column: str) -> float:
 
 def read_track(path: Path, frame_rate_hz: float) -> Track:
     """Read a track, as the head of this module describes it: positions become motion and truth.
+
+    Raises:
+        SourceError: If the file is damaged, holds pickled objects, or has other arrays in it.
+    """
+    _, times, positions = read_positions(path)
+    n = len(positions)
+    usable = np.isfinite(positions).all(axis=1)
+    if times is not None:
+        usable &= Clock(str(path), times, frame_rate_hz).usable
+    clock = np.arange(n) / frame_rate_hz if times is None else times
+    velocities, truth = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
+    if usable.any():
+        velocities[usable], truth[usable] = motion_along(clock[usable], positions[usable])
+    return Track(str(path), velocities, times, truth, [f"row {row}" for row in range(n)])
+
+
+def read_positions(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray]:
+    """Read all arrays of a track's file, and of them the times and positions, both ``float64``.
 
     Raises:
         SourceError: If the file is damaged, holds pickled objects, or has other arrays in it.
@@ -208,16 +257,8 @@ def read_track(path: Path, frame_rate_hz: float) -> Track:
             f"{path}: {', '.join(f'{key} is {shape}' for key, shape in shapes.items())}; "
             "expected numbers, pos (n, 2) in metres and t (n,) in seconds, n above 0"
         )
-    positions = arrays["pos"].astype(np.float64)
     times = arrays["t"].astype(np.float64) if "t" in arrays else None
-    usable = np.isfinite(positions).all(axis=1)
-    if times is not None:
-        usable &= Clock(str(path), times, frame_rate_hz).usable
-    clock = np.arange(n) / frame_rate_hz if times is None else times
-    velocities, truth = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
-    if usable.any():
-        velocities[usable], truth[usable] = motion_along(clock[usable], positions[usable])
-    return Track(str(path), velocities, times, truth, [f"row {row}" for row in range(n)])
+    return arrays, times, arrays["pos"].astype(np.float64)
 
 
 def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,15 +1,15 @@
 """Rendered worlds as sources: ``world:corridor?laps=2&people=1`` is a camera driven through one."""
 
-import difflib
 import math
 from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.render import Camera, render
 from neuroslam.sensors.scene import Billboard, World
 from neuroslam.sensors.source import IndexedSource
@@ -247,28 +247,4 @@ def open_world(spec: str) -> WorldSource:
     name, _, query = spec.removeprefix("world:").partition("?")
     if name not in catalogue():
         build_world(name)  # says which there are
-    values: dict[str, str] = {}
-    for item in filter(None, query.split("&")):
-        key, equals, value = item.partition("=")
-        if key not in WorldOptions.model_fields:
-            near = difflib.get_close_matches(key, WorldOptions.model_fields, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise SourceError(
-                f"world {name!r}: unknown option {key!r}; "
-                f"there are {', '.join(WorldOptions.model_fields)}{hint}"
-            )
-        if not equals or key in values:
-            problem = "is given twice" if key in values else "has no value"
-            raise SourceError(f"world {name!r}: option {key!r} {problem}; write {key}=VALUE once")
-        values[key] = value
-    try:
-        options = WorldOptions.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = first["loc"][0]
-        wish = first["msg"][0].lower() + first["msg"][1:]
-        meaning = WorldOptions.model_fields[key].description
-        raise SourceError(
-            f"world {name!r}: option {key}={values[key]!r}: {wish} ({meaning})"
-        ) from None
-    return WorldSource(name, options)
+    return WorldSource(name, parse_options(f"world {name!r}", query, WorldOptions))

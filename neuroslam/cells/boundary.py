@@ -1,0 +1,198 @@
+"""Boundary cells: the animal's distance and direction to walls, as rates of a population."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from neuroslam.config import BoundaryCellConfig
+from neuroslam.errors import BadFrame
+from neuroslam.geometry import TWO_PI
+from neuroslam.population import Running
+
+INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
+"""Zones of the activity of boundary cells, from far to near."""
+
+
+def boundary_zone(distance_m: Tensor, reach_m: float) -> Tensor:
+    r"""Tell in which zone an animal is, by its distance :math:`R` to the nearest wall.
+
+    .. math:: S = \text{inhibition } (R > b), \quad
+              \text{attenuation } (b/2 < R \le b), \quad \text{growth } (R \le b/2)
+
+    (SLRB, Eq. 1).
+
+    Example:
+        >>> boundary_zone(torch.tensor([0.5, 0.2, 0.1]), 0.3).tolist()
+        [0, 1, 2]
+    """
+    return (distance_m <= reach_m).long() + (distance_m <= reach_m / 2).long()
+
+
+def boundary_activity(
+    activity: Tensor, distance_m: Tensor, reach_m: float, rate_per_s: float, dt_s: float
+) -> Tensor:
+    r"""Let the activity grow near a wall, fade farther off, and end beyond reach.
+
+    .. math:: \dot h = \pm\tau\,\frac{b - R}{b}, \qquad 0 \le h \le 1
+
+    plus in the growth zone, minus in the attenuation zone; 0 in the inhibition zone (SLRB, Eq. 5,
+    as a rate and bounded: the printed recursion adds without end and takes the distance straight
+    ahead for that to the wall).
+
+    Args:
+        activity: :math:`h`, any shape.
+        distance_m: :math:`R` to the nearest wall, the same shape.
+        reach_m: :math:`b`.
+        rate_per_s: :math:`\tau`.
+        dt_s: Time since the last step.
+
+    Example:
+        >>> boundary_activity(torch.tensor(0.2), torch.tensor(0.1), 0.3, 0.8, 0.5).item()
+        0.466...
+    """
+    near = (reach_m - distance_m).clamp(0.0, reach_m) / reach_m
+    grows = torch.where(distance_m <= reach_m / 2, rate_per_s * dt_s, -rate_per_s * dt_s)
+    return (activity + grows * near).clamp(0.0, 1.0).where(distance_m <= reach_m, 0.0)
+
+
+def boundary_tuning(
+    distance_m: Tensor,
+    bearing_rad: Tensor,
+    preferred_m: Tensor,
+    preferred_rad: Tensor,
+    sigma_m: Tensor,
+    beta_m: Tensor,
+    sigma_rad: Tensor,
+) -> Tensor:
+    r"""Return the rates of boundary cells for the walls around.
+
+    .. math:: f_{kl} = \sum_\text{walls} \exp\!\Big(-\frac{(R - d_l)^2}{2\sigma_r^2(d_l)}\Big)
+              \exp\!\Big(-\frac{(\alpha - \varphi_k)^2}{2\sigma_a^2}\Big), \qquad
+              \sigma_r(d) = \sigma_0 (d/\beta + 1)
+
+    (SLRB, Eqs. 6 to 9, in the form of Hartley et al. 2000; the printed Eq. 6 has the activity in
+    the exponent, where an inactive cell would respond most.) Each factor peaks at 1.
+
+    Args:
+        distance_m: :math:`R`, ``(..., n_walls)``; ``inf`` for none.
+        bearing_rad: :math:`\alpha` in the world, ``(..., n_walls)``.
+        preferred_m: :math:`d_l`, ``(n_distances,)``.
+        preferred_rad: :math:`\varphi_k`, ``(n_bearings,)``.
+        sigma_m: :math:`\sigma_0`.
+        beta_m: :math:`\beta`.
+        sigma_rad: :math:`\sigma_a`.
+
+    Returns:
+        ``(..., n_bearings, n_distances)``, non-negative.
+    """
+    seen = distance_m.isfinite()
+    far = distance_m.where(seen, 0.0).unsqueeze(-1) - preferred_m
+    apart = (bearing_rad.unsqueeze(-1) - preferred_rad + math.pi).remainder(TWO_PI) - math.pi
+    width = sigma_m * (preferred_m / beta_m + 1.0)
+    by_distance = (-0.5 * (far / width).square()).exp() * seen.unsqueeze(-1)
+    by_bearing = (-0.5 * (apart / sigma_rad).square()).exp()
+    return by_bearing.transpose(-1, -2) @ by_distance
+
+
+class BoundaryCells(Running):
+    """Population of ``n_bearings`` by ``n_distances`` boundary cells.
+
+    :func:`boundary_tuning` has the mathematics; :func:`boundary_activity` gates all cells. The
+    state is that ``activity`` and the last ``rates``; the widths are parameters.
+
+    Args:
+        config: Sizes and widths.
+        batch: Number of animals side by side, or ``None`` for one.
+
+    Example:
+        >>> cells = BoundaryCells(BoundaryCellConfig())
+        >>> rates = cells(torch.tensor([0.1]), torch.tensor([0.0]), dt_s=1.0)
+        >>> divmod(rates.argmax().item(), cells.config.n_distances)  # bearing 0, nearest distance
+        (0, 2)
+    """
+
+    activity: Tensor
+    rates: Tensor
+    preferred_m: Tensor
+    preferred_rad: Tensor
+
+    def __init__(self, config: BoundaryCellConfig, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        lead = () if batch is None else (batch,)
+        n, m = config.n_bearings, config.n_distances
+        spacing = config.reach_m / (m + 1)
+        self.register_buffer("preferred_m", spacing * torch.arange(1, m + 1), persistent=False)
+        self.register_buffer("preferred_rad", torch.arange(n) * (TWO_PI / n), persistent=False)
+        self.register_buffer("activity", torch.zeros(lead))
+        self.register_buffer("rates", torch.zeros((*lead, n, m)))
+        self.sigma_m = nn.Parameter(torch.tensor(config.sigma_m))
+        self.beta_m = nn.Parameter(torch.tensor(config.beta_m))
+        self.sigma_rad = nn.Parameter(torch.tensor(config.sigma_bearing_rad))
+
+    def forward(self, distance_m: Tensor, bearing_rad: Tensor, dt_s: float) -> Tensor:
+        """Take in the walls around and return the rates.
+
+        Args:
+            distance_m: Distance to the foot of the perpendicular on each wall,
+                ``([batch,] n_walls)``; ``inf`` where there is none.
+            bearing_rad: Its bearing in the world, the same shape.
+            dt_s: Time since the last step.
+
+        Returns:
+            ``([batch,] n_bearings, n_distances)``, non-negative.
+
+        Raises:
+            BadFrame: If a distance is negative or NaN, or a bearing of a wall not finite.
+        """
+        check_walls(distance_m, bearing_rad)
+        distance_m, bearing_rad = distance_m.to(self.activity), bearing_rad.to(self.activity)
+        nearest = _nearest(distance_m)
+        c = self.config
+        self.activity = boundary_activity(
+            self.activity, nearest, c.reach_m, c.rate_per_s, dt_s
+        ).detach()
+        tuned = boundary_tuning(
+            distance_m,
+            bearing_rad,
+            self.preferred_m,
+            self.preferred_rad,
+            self.sigma_m,
+            self.beta_m,
+            self.sigma_rad,
+        )
+        rates = self.activity[..., None, None] * tuned
+        self.rates = rates.detach()
+        return rates
+
+
+def _nearest(distance_m: Tensor) -> Tensor:
+    if distance_m.shape[-1] == 0:
+        return distance_m.new_full(distance_m.shape[:-1], math.inf)
+    return distance_m.amin(-1)
+
+
+def check_walls(distance_m: Tensor, bearing_rad: Tensor) -> None:
+    """Refuse distances and bearings that no sensor can have measured.
+
+    Raises:
+        BadFrame: If shapes differ, a distance is negative or NaN, or a bearing not finite.
+
+    Example:
+        >>> check_walls(torch.tensor([-0.1]), torch.tensor([0.0]))
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: walls: distance -0.1 m; expected 0 or more, inf for none
+    """
+    if distance_m.shape != bearing_rad.shape:
+        raise BadFrame(
+            f"walls: distances have shape {tuple(distance_m.shape)}, bearings "
+            f"{tuple(bearing_rad.shape)}; expected the same"
+        )
+    if not bool((distance_m >= 0).all()):
+        wrong = distance_m[~(distance_m >= 0)][0].item()
+        raise BadFrame(f"walls: distance {wrong:g} m; expected 0 or more, inf for none")
+    if not bool(bearing_rad.isfinite().all()):
+        wrong = bearing_rad[~bearing_rad.isfinite()][0].item()
+        raise BadFrame(f"walls: bearing {wrong:g} rad; expected a finite number")

@@ -1,0 +1,184 @@
+"""Grid cells: a lateral anti-Hebbian network (LAHN) that finds hexagons in oscillators' phases."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from neuroslam.cells.oscillators import wave_vectors
+from neuroslam.config import GridCellConfig
+from neuroslam.population import Running
+
+_DEVELOPMENT_BATCH = 64
+_DEVELOPMENT_RANGE_M = 100.0
+
+
+class LAHNWeights(NamedTuple):
+    r"""What a lateral anti-Hebbian network learns.
+
+    Attributes:
+        feedforward: :math:`Q`, ``(..., n_modules, n_cells, n_inputs)``, rows of unit norm.
+        lateral: :math:`W \le 0`, ``(..., n_modules, n_cells, n_cells)``, zero diagonal.
+        threshold: Above it a cell learns, ``(..., n_modules, n_cells)``.
+        bias: Above it a cell fires, the same shape.
+    """
+
+    feedforward: Tensor
+    lateral: Tensor
+    threshold: Tensor
+    bias: Tensor
+
+
+def lahn_drive(inputs: Tensor, rates: Tensor, feedforward: Tensor, lateral: Tensor) -> Tensor:
+    r"""Return the input currents of the cells.
+
+    .. math:: \xi_i = \sum_j q_{ij} x_j + \sum_k w_{ik} r_k(t-1)
+
+    (SLRB, Eq. 12).
+
+    Args:
+        inputs: :math:`x`, ``(..., n_modules, n_inputs)``.
+        rates: :math:`r(t-1)`, ``(..., n_modules, n_cells)``.
+        feedforward: :math:`Q`.
+        lateral: :math:`W`.
+    """
+    forward = (feedforward @ inputs.unsqueeze(-1)).squeeze(-1)
+    return forward + (lateral @ rates.unsqueeze(-1)).squeeze(-1)
+
+
+def lahn_learn(
+    inputs: Tensor, drive: Tensor, weights: LAHNWeights, config: GridCellConfig
+) -> LAHNWeights:
+    r"""Learn from inputs and the drive they caused (Földiák 1990; Oja 1982).
+
+    .. math:: s &= [\xi - \theta]_+^2, \\
+              \Delta Q &= \eta\, s\,(x - (Qx)\,Q)^\top \text{, rows to unit norm}, \\
+              \Delta W &= -\mu\,(s s^\top - \rho^2), \quad W \le 0, \quad W_{ii} = 0, \\
+              \Delta\theta &= \gamma\,(s - \rho)
+
+    The square lets the rule climb :math:`E[s^3]`. Of waves 60 degrees apart that is greatest for
+    equal amplitudes whose phases close, which is a hexagon; a linear rule returns any mixture.
+    The firing bias follows the quantile of the drive below which a cell is silent.
+
+    Args:
+        inputs: :math:`x`, ``(samples, n_modules, n_inputs)``.
+        drive: :math:`\xi`, ``(samples, n_modules, n_cells)``.
+        weights: What was known before.
+        config: Rates of learning.
+
+    Returns:
+        What is known now.
+    """
+    q, w, threshold, bias = weights
+    n = len(inputs)
+    s = (drive - threshold).clamp_min(0.0).square()
+    onto = (q @ inputs.unsqueeze(-1)).squeeze(-1)
+    hebb = torch.einsum("smc,smi->mci", s, inputs) / n - (s * onto).mean(0).unsqueeze(-1) * q
+    q = q + config.hebbian_rate * hebb
+    q = q / q.norm(dim=-1, keepdim=True)
+    together = torch.einsum("smc,smk->mck", s, s) / n
+    w = (w - config.lateral_rate * (together - config.sparseness**2)).clamp_max(0.0)
+    w = w * (1.0 - torch.eye(w.shape[-1], dtype=w.dtype, device=w.device))
+    threshold = threshold + config.threshold_rate * (s.mean(0) - config.sparseness)
+    fires = (drive > bias).to(bias).mean(0)
+    bias = bias + config.threshold_rate * (fires - (1.0 - config.silent_fraction))
+    return LAHNWeights(q, w, threshold, bias)
+
+
+class LAHNGridCells(Running):
+    """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
+
+    :func:`lahn_drive` and :func:`lahn_learn` have the mathematics. A network is made with weights
+    that developed on random positions, of no environment; ``learn`` goes on from there.
+    State: the parameters ``feedforward`` and ``lateral``, the buffers ``threshold``, ``bias`` and
+    ``rates``, and the generator of its random start. Animals of a batch have one network.
+
+    Args:
+        config: Modules, cells, rates of learning.
+        batch: Number of animals side by side, or ``None`` for one.
+
+    Example:
+        >>> from neuroslam.cells.oscillators import VelocityOscillators
+        >>> config = GridCellConfig(development_steps=10)
+        >>> cells, oscillators = LAHNGridCells(config), VelocityOscillators(config)
+        >>> cells(oscillators(torch.tensor([0.2, 0.1]), dt_s=0.05)).shape
+        torch.Size([4, 24])
+    """
+
+    threshold: Tensor
+    bias: Tensor
+    rates: Tensor
+    generator_state: Tensor
+
+    def __init__(self, config: GridCellConfig, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        m, n, inputs = len(config.spacings_m), config.n_cells, 2 * config.directions
+        generator = torch.Generator().manual_seed(config.seed)
+        start = torch.randn(m, n, inputs, generator=generator)
+        weights = LAHNWeights(
+            start / start.norm(dim=-1, keepdim=True),
+            torch.zeros(m, n, n),
+            torch.zeros(m, n),
+            torch.zeros(m, n),
+        )
+        self.feedforward = nn.Parameter(weights.feedforward)
+        self.lateral = nn.Parameter(weights.lateral)
+        self.register_buffer("threshold", weights.threshold)
+        self.register_buffer("bias", weights.bias)
+        lead = () if batch is None else (batch,)
+        self.register_buffer("rates", torch.zeros(*lead, m, n))
+        self.register_buffer("generator_state", generator.get_state())
+        self.develop(config.development_steps)
+
+    @property
+    def weights(self) -> LAHNWeights:
+        """All that is learnt."""
+        return LAHNWeights(self.feedforward, self.lateral, self.threshold, self.bias)
+
+    @torch.no_grad()
+    def develop(self, steps: int) -> None:
+        """Learn from phases at random positions far and wide, as before the eyes open."""
+        c = self.config
+        generator = torch.Generator()
+        generator.set_state(self.generator_state)
+        kind = self.bias.dtype
+        waves = wave_vectors(
+            torch.tensor(c.spacings_m, dtype=kind),
+            torch.tensor(c.orientations_deg, dtype=kind).deg2rad(),
+            c.directions,
+        )
+        for _ in range(steps):
+            at = torch.rand(_DEVELOPMENT_BATCH, 2, generator=generator) - 0.5
+            angle = torch.einsum("mjd,sd->smj", waves, _DEVELOPMENT_RANGE_M * at)
+            self.learn(torch.cat([angle.cos(), angle.sin()], dim=-1).to(self.bias))
+        self.generator_state = generator.get_state()
+
+    @torch.no_grad()
+    def learn(self, inputs: Tensor) -> None:
+        """Learn from inputs, ``(samples, n_modules, 2 * directions)``, as if each was held."""
+        q, w, _, bias = self.weights
+        rates = (inputs.unsqueeze(-2) @ q.mT).squeeze(-2).sub(bias).clamp_min(0.0)
+        learnt = lahn_learn(inputs, lahn_drive(inputs, rates, q, w), self.weights, self.config)
+        self.feedforward.copy_(learnt.feedforward)
+        self.lateral.copy_(learnt.lateral)
+        self.threshold, self.bias = learnt.threshold, learnt.bias
+
+    def forward(self, phases: Tensor) -> Tensor:
+        r"""Take in the oscillators' phases and return the rates :math:`[\xi - b]_+`.
+
+        Args:
+            phases: Cosine and sine, ``([batch,] 2, n_modules, directions)``.
+
+        Returns:
+            ``([batch,] n_modules, n_cells)``, non-negative.
+        """
+        inputs = torch.cat(phases.unbind(-3), dim=-1).to(self.bias.dtype)
+        drive = lahn_drive(inputs, self.rates, self.feedforward, self.lateral)
+        rates = (drive - self.bias).clamp_min(0.0)
+        self.rates = rates.detach()
+        if self.config.learns_online:
+            with torch.no_grad():
+                self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]))
+        return rates

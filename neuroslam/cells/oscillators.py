@@ -1,0 +1,166 @@
+"""Velocity-controlled oscillators: phases that turn as the animal moves, one for each direction."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from neuroslam.config import GridCellConfig
+from neuroslam.population import Running
+
+
+def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
+    r"""Return the wave vectors of modules of oscillators, evenly over the full turn.
+
+    .. math:: \mathbf k_{mj} = \frac{4\pi}{\sqrt 3\,\lambda_m}
+              (\cos\beta_{mj}, \sin\beta_{mj}), \qquad \beta_{mj} = \beta_m + 2\pi j / D
+
+    Args:
+        spacing_m: :math:`\lambda`, spacing of the fields of a grid cell, ``(n_modules,)``.
+        orientation_rad: :math:`\beta_m`, ``(n_modules,)``.
+        directions: :math:`D`; with six the waves close in triangles, and their sums are hexagons.
+
+    Returns:
+        rad/m, ``(n_modules, directions, 2)``.
+    """
+    steps = torch.arange(directions, dtype=spacing_m.dtype, device=spacing_m.device)
+    beta = orientation_rad[:, None] + steps * (2 * math.pi / directions)
+    k = 4 * math.pi / (math.sqrt(3) * spacing_m)
+    return k[:, None, None] * torch.stack([beta.cos(), beta.sin()], dim=-1)
+
+
+def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor:
+    r"""Turn the oscillators by a displacement and draw them to the unit circle.
+
+    .. math:: z_j \leftarrow z_j\,e^{i\,\mathbf k_j \cdot \Delta x}, \qquad
+              |z| \leftarrow \tfrac12 (3 - |z|^2)\,|z|
+
+    This is the Hopf oscillator :math:`\dot z = i\omega z + z(1 - |z|^2)`, SLRB Eqs. 10 and 11,
+    with :math:`\omega_j = \mathbf k_j \cdot \mathbf v` integrated exactly. (Euler steps of it leave
+    the unit circle, by half at 15 rad/s. The boundary response that Eqs. 10 and 11 add to every
+    frequency turns all phases alike and means nothing; walls correct the phases instead.) The
+    second step is one of Newton's for :math:`|z| = 1`: it takes back what rounding adds.
+
+    Args:
+        waves: :math:`\mathbf k`, ``(n_modules, directions, 2)``.
+        displacement_m: :math:`\Delta x`, ``(..., 2)``.
+        phases: :math:`z` as cosine and sine, ``(..., 2, n_modules, directions)``.
+
+    Example:
+        >>> waves = wave_vectors(torch.tensor([0.5]), torch.tensor([0.0]), 6)
+        >>> start = torch.stack([torch.ones(1, 6), torch.zeros(1, 6)])
+        >>> lap = torch.tensor([0.5 * 3**0.5 / 2, 0.0])  # a whole wave along x
+        >>> turn_phases(waves, lap, start)[0, 0, 0].item()
+        1.0
+    """
+    angle = (waves @ displacement_m[..., None, :, None]).squeeze(-1)
+    c, s = angle.cos(), angle.sin()
+    x, y = phases.unbind(-3)
+    x, y = x * c - y * s, x * s + y * c
+    pull = 1.5 - 0.5 * (x * x + y * y)
+    return torch.stack([x * pull, y * pull], dim=-3)
+
+
+def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor) -> Tensor:
+    r"""Find the position, near a given one, that fits all phases best.
+
+    .. math:: x = x_0 + K^{+} \arg\!\big(z\,e^{-iKx_0}\big)
+
+    Least squares over all modules; exact while :math:`|\mathbf k \cdot (x - x_0)| < \pi`.
+
+    Args:
+        waves: :math:`K`, ``(n_modules, directions, 2)``.
+        solver: Its pseudo-inverse, ``(2, n_modules * directions)``.
+        phases: :math:`z`, ``(..., 2, n_modules, directions)``.
+        near_m: :math:`x_0`, ``(..., 2)``.
+
+    Returns:
+        ``(..., 2)`` in metres.
+    """
+    angle = (waves @ near_m[..., None, :, None]).squeeze(-1)
+    c, s = angle.cos(), angle.sin()
+    x, y = phases.unbind(-3)
+    off = torch.atan2(y * c - x * s, x * c + y * s).flatten(-2)
+    return near_m + off @ solver.mT
+
+
+class VelocityOscillators(Running):
+    """Modules of oscillators whose phases integrate motion; state: ``phases`` and ``position_m``.
+
+    :func:`turn_phases` has the mathematics. The field spacings are parameters.
+
+    Args:
+        config: Spacings, orientations, number of directions.
+        batch: Number of animals side by side, or ``None`` for one.
+
+    Example:
+        >>> oscillators = VelocityOscillators(GridCellConfig())
+        >>> oscillators(torch.tensor([0.2, 0.0]), dt_s=0.5).shape
+        torch.Size([2, 4, 6])
+        >>> oscillators.position_m.tolist()
+        [0.1..., 0.0...]
+    """
+
+    phases: Tensor
+    position_m: Tensor
+    orientation_rad: Tensor
+
+    def __init__(self, config: GridCellConfig, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        lead = () if batch is None else (batch,)
+        kind = torch.float64
+        self.spacing_m = nn.Parameter(torch.tensor(config.spacings_m, dtype=kind))
+        angles = torch.tensor(config.orientations_deg, dtype=kind).deg2rad()
+        self.register_buffer("orientation_rad", angles, persistent=False)
+        start = torch.zeros(*lead, 2, len(angles), config.directions, dtype=kind)
+        start[..., 0, :, :] = 1.0
+        self.register_buffer("phases", start)
+        self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
+        self._waves: tuple[int, Tensor, Tensor] | None = None
+
+    @property
+    def waves(self) -> Tensor:
+        """Wave vectors in rad/m, ``(n_modules, directions, 2)``; they follow from the spacings."""
+        return wave_vectors(self.spacing_m, self.orientation_rad, self.config.directions)
+
+    def _kept_waves(self) -> tuple[Tensor, Tensor]:
+        if torch.is_grad_enabled() and self.spacing_m.requires_grad:
+            return self.waves, torch.linalg.pinv(self.waves.flatten(0, 1))
+        version = self.spacing_m._version
+        kept = self._waves
+        if kept is None or kept[0] != version or kept[1].device != self.spacing_m.device:
+            with torch.inference_mode(mode=False), torch.no_grad():
+                waves = self.waves
+                kept = version, waves, torch.linalg.pinv(waves.flatten(0, 1))
+            self._waves = kept
+        return kept[1:]
+
+    def forward(self, velocity_m_s: Tensor, dt_s: float | Tensor) -> Tensor:
+        """Move with a velocity in the world, ``([batch,] 2)``, and return the phases."""
+        return self.shift(velocity_m_s * dt_s)
+
+    def shift(self, displacement_m: Tensor) -> Tensor:
+        """Move by a displacement, ``([batch,] 2)``: all modules by the same, so they agree.
+
+        Returns:
+            Phases as cosine and sine, ``([batch,] 2, n_modules, directions)``.
+        """
+        waves, solver = self._kept_waves()
+        step = displacement_m.to(self.position_m)
+        phases = turn_phases(waves, step, self.phases)
+        self.phases = phases.detach()
+        position = decode_phases(waves, solver, phases, self.position_m + step)
+        self.position_m = position.detach()
+        return phases
+
+    def place_at(self, position_m: Tensor) -> Tensor:
+        """Set the phases to those of a position, ``([batch,] 2)``, and return them."""
+        waves, _ = self._kept_waves()
+        start = torch.zeros_like(self.phases)
+        start[..., 0, :, :] = 1.0
+        position_m = position_m.to(self.position_m)
+        self.phases = turn_phases(waves, position_m, start).detach()
+        self.position_m = position_m.detach().clone()
+        return self.phases

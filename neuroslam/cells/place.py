@@ -1,0 +1,289 @@
+"""Place cells: a competitive Hebbian network on grid cells, which recruits cells as it explores."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.config import PlaceCellConfig
+from neuroslam.population import Running
+
+NEIGHBOURS = 12
+"""Links of a place cell to others that were active before or after it, at most."""
+
+_WINDOW = 64  # nearest cells, among which the winner is
+_SLACK_M = 0.06  # the animal may move so far before the window is looked up anew
+_NO_CELL = -1
+_FAR_M = 1e6
+
+
+class PlaceResponse(NamedTuple):
+    """What the place cells say.
+
+    Attributes:
+        winner: Number of the cell that wins, ``([batch])``; -1 while there is none.
+        recruited: Whether it was recruited just now.
+        changed: Whether another cell won before.
+    """
+
+    winner: Tensor
+    recruited: Tensor
+    changed: Tensor
+
+
+def place_response(
+    weights: Tensor,
+    centres_m: Tensor,
+    grid: Tensor,
+    position_m: Tensor,
+    power: float,
+    continuity_m: float,
+) -> Tensor:
+    r"""Return the responses of place cells before they compete.
+
+    .. math:: p_j = [\mathbf w_j \cdot \hat{\mathbf g}]_+^a
+              \exp\!\Big(-\frac{|X_j - x|^2}{2\sigma^2}\Big)
+
+    The second factor keeps a place from being taken for another, farther one with the same phases
+    of the grid (SLRB, Algorithm 1, has none).
+
+    Args:
+        weights: :math:`\mathbf w_j`, unit vectors, ``(..., n, n_grid)``.
+        centres_m: :math:`X_j`, ``(..., n, 2)``.
+        grid: :math:`\hat{\mathbf g}`, the grid cells' rates as a unit vector, ``(..., n_grid)``.
+        position_m: :math:`x`, ``(..., 2)``.
+        power: :math:`a`.
+        continuity_m: :math:`\sigma`.
+
+    Returns:
+        ``(..., n)``, from 0 to 1.
+    """
+    alike = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0)
+    away = (centres_m - position_m.unsqueeze(-2)).square().sum(-1)
+    return alike.pow(power) * (away * (-0.5 / continuity_m**2)).exp().to(alike)
+
+
+def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
+    r"""Move the winner's weights towards the pattern that it won with.
+
+    .. math:: \mathbf w \leftarrow \frac{\mathbf w + \eta(\hat{\mathbf g} - \mathbf w)}{|\cdot|}
+
+    Example:
+        >>> hebbian_step(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0]), 0.5).tolist()
+        [0.707..., 0.707...]
+    """
+    moved = weights + rate * (grid - weights)
+    return moved / moved.norm(dim=-1, keepdim=True)
+
+
+class CompetitiveHebbianPlaceCells(Running):
+    """Place cells that compete for the patterns of grid cells; a new one is recruited far from all.
+
+    :func:`place_response` and :func:`hebbian_step` have the mathematics. The winner is found among
+    the nearest cells: beyond them the response is bounded by the distance alone. State: for every
+    cell its ``weights``, ``centres_m``, ``visits``, ``time_s`` and ``neighbours`` (the graph of
+    places: cells that won one after the other), and the window of nearest cells.
+
+    Args:
+        config: Distance between cells, power, learning.
+        n_grid: Number of grid cells.
+        batch: Number of animals side by side, or ``None`` for one.
+
+    Example:
+        >>> cells = CompetitiveHebbianPlaceCells(PlaceCellConfig(), n_grid=2)
+        >>> cells(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 0.0]), dt_s=0.1).recruited.item()
+        True
+        >>> cells(torch.tensor([0.9, 0.1]), torch.tensor([0.01, 0.0]), dt_s=0.1).winner.item()
+        0
+    """
+
+    n_cells: Tensor
+    weights: Tensor
+    centres_m: Tensor
+    visits: Tensor
+    time_s: Tensor
+    neighbours: Tensor
+    winner: Tensor
+    window: Tensor
+    window_at_m: Tensor
+
+    def __init__(self, config: PlaceCellConfig, n_grid: int, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        b = batch or 1
+        self.register_buffer("n_cells", torch.zeros(b, dtype=torch.int64))
+        self.register_buffer("weights", torch.zeros(b, _WINDOW, n_grid))
+        self.register_buffer("centres_m", torch.full((b, _WINDOW, 2), _FAR_M, dtype=torch.float64))
+        self.register_buffer("visits", torch.zeros(b, _WINDOW, dtype=torch.int64))
+        self.register_buffer("time_s", torch.zeros(b, _WINDOW, dtype=torch.float64))
+        none = torch.full((b, _WINDOW, NEIGHBOURS), _NO_CELL, dtype=torch.int64)
+        self.register_buffer("neighbours", none)
+        self.register_buffer("winner", torch.full((b,), _NO_CELL, dtype=torch.int64))
+        self.register_buffer("window", torch.arange(_WINDOW).repeat(b, 1))
+        self.register_buffer("window_at_m", torch.full((b, 2), _FAR_M, dtype=torch.float64))
+        self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
+        self.register_load_state_dict_pre_hook(_take_capacity)
+        self.register_load_state_dict_post_hook(lambda module, _: module._forget_window())
+
+    @property
+    def capacity(self) -> int:
+        """Cells there is room for before the tables grow."""
+        return self.weights.shape[1]
+
+    def _forget_window(self) -> None:
+        self._near = None
+
+    def forward(
+        self, grid: Tensor, position_m: Tensor, dt_s: float, *, learns: bool = True
+    ) -> PlaceResponse:
+        """Let the cells compete; recruit one where none is near, and let the winner learn.
+
+        Args:
+            grid: Rates of the grid cells, ``([batch,] n_grid)``.
+            position_m: Position that the phases of the grid tell, ``([batch,] 2)``.
+            dt_s: Time since the last step.
+            learns: Recruit and learn; else only respond.
+        """
+        one = self.batch is None
+        grid = (grid[None] if one else grid).detach().to(self.weights)
+        grid = grid / grid.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        position = (position_m[None] if one else position_m).detach().to(self.centres_m)
+        weights, centres = self._nearest(position)
+        c = self.config
+        response = place_response(weights, centres, grid, position, c.power, c.continuity_m)
+        best = response.argmax(-1, keepdim=True)
+        winner = self.window.gather(1, best)[:, 0]
+        away = (centres - position.unsqueeze(1)).square().sum(-1)
+        recruited = away.amin(-1) >= c.threshold_m**2
+        if learns:
+            if bool(recruited.any()):
+                winner = self._recruit(recruited, grid, position, winner)
+            if c.hebbian_rate:
+                self._learn(grid, winner, best, ~recruited)
+        else:
+            recruited = torch.zeros_like(recruited)
+            winner = winner.where(self.n_cells > 0, _NO_CELL)
+        changed = winner != self.winner
+        if learns:
+            if bool(changed.any()):
+                self._enter(changed, winner)
+            self.time_s.scatter_add_(1, winner.unsqueeze(1), torch.full_like(position[:, :1], dt_s))
+        self.winner = winner
+        result = PlaceResponse(winner, recruited, changed)
+        return PlaceResponse(*(part[0] for part in result)) if one else result
+
+    def responses(self, grid: Tensor, position_m: Tensor | None = None) -> Tensor:
+        """Return the responses of all cells, ``([batch,] n)``, zero where there is none.
+
+        Args:
+            grid: Rates of the grid cells, ``([batch,] n_grid)``.
+            position_m: Where the animal is; ``None``: the response to the grid alone.
+        """
+        one = self.batch is None
+        grid = (grid[None] if one else grid).to(self.weights)
+        grid = grid / grid.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        c, n = self.config, int(self.n_cells.max())
+        weights = self.weights[:, :n]
+        if position_m is None:
+            response = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0).pow(c.power)
+        else:
+            position = (position_m[None] if one else position_m).to(self.centres_m)
+            response = place_response(
+                weights, self.centres_m[:, :n], grid, position, c.power, c.continuity_m
+            )
+        return response[0] if one else response
+
+    def centre_of(self, cells: Tensor) -> Tensor:
+        """Return where cells lie, ``([batch,] 2)``, for one cell of each animal."""
+        at = cells.reshape(-1, 1, 1).expand(-1, 1, 2)
+        centres = self.centres_m.gather(1, at)[:, 0]
+        return centres[0] if self.batch is None else centres
+
+    def graph(self, animal: int = 0) -> tuple[Tensor, Tensor]:
+        """Return the graph of places: centres ``(n, 2)`` and links ``(m, 2)``, each once."""
+        n = int(self.n_cells[animal])
+        neighbours = self.neighbours[animal, :n]
+        start, slot = (neighbours >= 0).nonzero(as_tuple=True)
+        links = torch.stack([start, neighbours[start, slot]], dim=1)
+        links = torch.unique(links.sort(dim=1).values, dim=0)
+        return self.centres_m[animal, :n].clone(), links
+
+    def _nearest(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return weights and centres of the nearest cells of each animal."""
+        moved = (position - self.window_at_m).square().sum(-1)
+        if bool((moved > _SLACK_M**2).any()):
+            n = max(_WINDOW, int(self.n_cells.max()))
+            away = (self.centres_m[:, :n] - position.unsqueeze(1)).square().sum(-1)
+            self.window = away.topk(_WINDOW, dim=1, largest=False).indices
+            self.window_at_m = position
+            self._near = None
+        if self._near is None:
+            at = self.window.unsqueeze(-1)
+            self._near = (
+                self.weights.gather(1, at.expand(-1, -1, self.weights.shape[2])),
+                self.centres_m.gather(1, at.expand(-1, -1, 2)),
+            )
+        return self._near
+
+    def _recruit(self, recruited: Tensor, grid: Tensor, position: Tensor, winner: Tensor) -> Tensor:
+        rows = recruited.nonzero()[:, 0]
+        new = self.n_cells[rows]
+        if int(new.max()) >= self.capacity:
+            self._grow()
+        self.weights[rows, new] = grid[rows]
+        self.centres_m[rows, new] = position[rows]
+        self.n_cells = self.n_cells + recruited.long()
+        # The newcomer takes the place of the farthest in the window, or it is in there already.
+        at = self.window[rows]
+        is_in = at == new.unsqueeze(1)
+        centres = self._near[1][rows]
+        away = (centres - position[rows].unsqueeze(1)).square().sum(-1)
+        slot = torch.where(is_in.any(1), is_in.long().argmax(1), away.argmax(1))
+        window = self.window.clone()
+        window[rows, slot] = new
+        self.window = window
+        self._near[0][rows, slot] = grid[rows]
+        self._near[1][rows, slot] = position[rows]
+        return winner.where(~recruited, self.n_cells - 1)
+
+    def _learn(self, grid: Tensor, winner: Tensor, slot: Tensor, which: Tensor) -> None:
+        near = self._near[0]
+        at = slot.unsqueeze(-1).expand(-1, 1, near.shape[-1])
+        before = near.gather(1, at)
+        after = hebbian_step(before, grid.unsqueeze(1), self.config.hebbian_rate)
+        after = after.where(which[:, None, None], before)
+        near.scatter_(1, at, after.where(which[:, None, None], near.gather(1, at)))
+        rows = torch.arange(len(winner), device=winner.device)[which]
+        self.weights[rows, winner[which]] = after[which, 0]
+
+    def _enter(self, changed: Tensor, winner: Tensor) -> None:
+        rows = changed.nonzero()[:, 0]
+        new, old = winner[rows], self.winner[rows]
+        self.visits[rows, new] += 1
+        linked = old >= 0
+        rows, new, old = rows[linked], new[linked], old[linked]
+        for start, end in ((old, new), (new, old)):
+            links = self.neighbours[rows, start]
+            known = (links == end.unsqueeze(1)).any(1)
+            free = links == _NO_CELL
+            add = ~known & free.any(1)
+            slot = free.long().argmax(1)
+            self.neighbours[rows[add], start[add], slot[add]] = end[add]
+
+    def _grow(self) -> None:
+        for name, empty in _EMPTY.items():
+            old = getattr(self, name)
+            setattr(self, name, torch.cat([old, torch.full_like(old, empty)], dim=1))
+
+
+_EMPTY = {"weights": 0.0, "centres_m": _FAR_M, "visits": 0, "time_s": 0.0, "neighbours": _NO_CELL}
+
+
+def _take_capacity(
+    module: torch.nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    for name in _EMPTY:
+        saved = state.get(prefix + name)
+        if saved is not None and len(saved) == len(getattr(module, name)):
+            setattr(module, name, getattr(module, name).new_empty(saved.shape))

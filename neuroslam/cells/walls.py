@@ -1,0 +1,415 @@
+r"""Memory of walls: remembered boundary vectors, and the correction of the position by them.
+
+A wall tells where the animal is *perpendicular* to it, and nothing along it (Hardcastle et al.
+2015). What is remembered of a stretch of wall is a boundary vector: where the animal was (the
+anchor), the bearing and the distance of the wall from there. Position, errors of self-motion and
+remembered distances have a common Gaussian belief (an extended Kalman filter over walls), so that a
+wall seen early, while little had drifted, counts for more than one seen late, and the constant
+errors of speed and compass are learnt from walls too.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.cells.boundary import check_walls
+from neuroslam.config import WallMemoryConfig
+from neuroslam.errors import BadFrame
+from neuroslam.geometry import TWO_PI
+from neuroslam.population import Running
+from neuroslam.storage import Scalars
+
+OWN = 4
+"""First rows of the covariance: position x and y, share of the speed too much, compass error."""
+
+ACTIVE = 96
+"""Walls, the nearest ones, whose errors are known to go together; more are kept besides."""
+
+_UNKNOWN_M2 = 1.0  # variance of a distance before it was measured
+
+
+class Wall(NamedTuple):
+    """Columns of the memory: anchor, bearing and distance of a wall from there, its variance."""
+
+    x_m: Tensor
+    y_m: Tensor
+    bearing_rad: Tensor
+    distance_m: Tensor
+    variance_m2: Tensor
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Bring angles into [-pi, pi)."""
+    return (angle + math.pi).remainder(TWO_PI) - math.pi
+
+
+def wall_innovation(
+    position_m: Tensor, distance_m: Tensor, bearing_rad: Tensor, wall: Wall
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Compare a wall with the memory of it.
+
+    .. math:: \nu = R - R_m - (x_m - x) \cdot \mathbf n, \qquad
+              \mathbf n = \frac{(\cos\gamma, \sin\gamma)}{\cos((\alpha - \alpha_m)/2)}, \quad
+              \gamma = \frac{\alpha + \alpha_m}{2}
+
+    The chord between two feet of perpendiculars is normal to the mean bearing: exactly for a
+    straight wall and for a circle, to second order for any other. (With the bearing of now in
+    place of the mean, a curved wall seems the farther the more it curves, and pulls.)
+
+    Args:
+        position_m: :math:`x`, ``(..., 2)``.
+        distance_m: :math:`R`, ``(...)``.
+        bearing_rad: :math:`\alpha` in the world, ``(...)``.
+        wall: :math:`x_m, \alpha_m, R_m`.
+
+    Returns:
+        :math:`\nu` in metres; :math:`\mathbf n`, ``(..., 2)``; the lever in metres, distance along
+        the wall between the two places, by which an error of bearing counts.
+    """
+    half = wrap(bearing_rad - wall.bearing_rad) / 2
+    middle = wall.bearing_rad + half
+    normal = torch.stack([middle.cos(), middle.sin()], dim=-1) / half.cos().unsqueeze(-1)
+    dx, dy = wall.x_m - position_m[..., 0], wall.y_m - position_m[..., 1]
+    nx, ny = normal.unbind(-1)
+    return distance_m - wall.distance_m - dx * nx - dy * ny, normal, dy * nx - dx * ny
+
+
+class WallMemory(Running):
+    """Remembered walls of an animal, and its belief about its own errors.
+
+    :func:`wall_innovation` has the geometry. The state is complete: all remembered walls
+    (``walls``, ``n_walls``), which of them are active (``active``), the covariance, the learnt
+    errors of speed and compass (``errors``), and the motion since the last look.
+
+    Args:
+        config: Noise of motion and senses, what is one wall.
+        batch: Number of animals side by side, or ``None`` for one.
+
+    Example:
+        >>> memory = WallMemory(WallMemoryConfig(period_s=0.0))
+        >>> at, wall = torch.zeros(2), (torch.tensor([0.2]), torch.tensor([0.0]))
+        >>> memory.look(at, *wall).tolist(), memory.n_walls.item()  # a new wall corrects nothing
+        ([0.0, 0.0], 1)
+        >>> moved = memory.move(torch.tensor(0.1), torch.tensor(0.0), dt_s=0.5)
+        >>> memory.look(at + moved, *wall)[0].item() < 0  # the wall is as far as before
+        True
+    """
+
+    walls: Tensor
+    n_walls: Tensor
+    active: Tensor
+    covariance: Tensor
+    errors: Tensor
+    moved_m: Tensor
+    spread_m2: Tensor
+    innovation: Tensor
+
+    def __init__(self, config: WallMemoryConfig, batch: int | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        b, kind = batch or 1, {"dtype": torch.float64}
+        self.register_buffer("walls", torch.zeros(b, 0, len(Wall._fields), **kind))
+        self.register_buffer("n_walls", torch.zeros(b, dtype=torch.int64))
+        self.register_buffer("active", torch.full((b, 0), -1))
+        self.register_buffer("covariance", torch.zeros(b, OWN, OWN, **kind))
+        self.register_buffer("errors", torch.zeros(b, 2, **kind))
+        self.register_buffer("moved_m", torch.zeros(b, 2, **kind))
+        self.register_buffer("spread_m2", torch.zeros(b, 2, 2, **kind))
+        self.register_buffer("innovation", torch.zeros(b, **kind))
+        self.since = Scalars(s=0.0, squares_s2=0.0)
+        variances = [0.0, 0.0, config.speed_scale**2, math.radians(config.heading_slow_deg) ** 2]
+        self.covariance[:] = torch.diag(torch.tensor(variances, **kind))
+        self.register_load_state_dict_pre_hook(_take_sizes)
+
+    @property
+    def position_variance_m2(self) -> Tensor:
+        """Covariance of the position, ``(batch or 1, 2, 2)``, as of the last look."""
+        return self.covariance[:, :2, :2]
+
+    def remembered(self) -> list[Wall]:
+        """Return all walls of each animal, as columns."""
+        return [
+            Wall(*rows[:n].unbind(-1))
+            for rows, n in zip(self._up_to_date(), self.n_walls.tolist(), strict=True)
+        ]
+
+    def move(self, speed_m_s: Tensor, heading_rad: Tensor, dt_s: float) -> Tensor:
+        """Return the displacement in the world, ``([batch,] 2)``, with the learnt errors taken off.
+
+        Args:
+            speed_m_s: Measured speed, ``([batch])``.
+            heading_rad: Measured heading, ``([batch])``.
+            dt_s: For how long.
+
+        Raises:
+            BadFrame: If speed or heading are not finite.
+        """
+        speed_m_s, heading_rad = speed_m_s.to(self.errors), heading_rad.to(self.errors)
+        if not bool((speed_m_s.isfinite() & heading_rad.isfinite()).all()):
+            raise BadFrame(
+                f"motion: speed {speed_m_s.reshape(-1).tolist()[:3]} m/s, heading "
+                f"{heading_rad.reshape(-1).tolist()[:3]} rad; expected finite numbers"
+            )
+        scale, compass = self.errors.unbind(-1)
+        heading = heading_rad - compass
+        length = speed_m_s * dt_s * (1.0 - scale)
+        step = length.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], dim=-1)
+        self.moved_m = self.moved_m + step
+        self.spread_m2 = self.spread_m2 + step.unsqueeze(-1) * step.unsqueeze(-2)
+        self.since.s += dt_s
+        self.since.squares_s2 += dt_s * dt_s
+        return step if self.batch is not None else step[0]
+
+    def look(
+        self,
+        position_m: Tensor,
+        distance_m: Tensor,
+        bearing_rad: Tensor,
+        *,
+        compass: bool = True,
+        learns: bool = True,
+    ) -> Tensor:
+        """Take in the walls around; returns by how much the position is corrected.
+
+        Args:
+            position_m: Where the animal believes to be, ``([batch,] 2)``.
+            distance_m: Distance to the foot of the perpendicular on each wall, nearest first,
+                ``([batch,] n_walls)``; ``inf`` where there is none.
+            bearing_rad: Its bearing in the world as measured: heading plus bearing from it.
+            compass: The heading is measured, so its error stays bounded; else it is integrated.
+            learns: Remember walls that are new.
+
+        Returns:
+            Displacement in metres, ``([batch,] 2)``.
+
+        Raises:
+            BadFrame: If a distance is negative or NaN, or a bearing not finite.
+        """
+        check_walls(distance_m, bearing_rad)
+        one = self.batch is None
+        position = (position_m[None] if one else position_m).to(self.errors)
+        if self.since.s < self.config.period_s - 1e-9:
+            return torch.zeros_like(position[0] if one else position)
+        distance = (distance_m[None] if one else distance_m).to(self.errors)
+        bearing = (bearing_rad[None] if one else bearing_rad).to(self.errors)
+        self._predict(compass)
+        start = position
+        self.innovation = torch.zeros_like(self.innovation)
+        for wall in range(distance.shape[-1]):
+            seen = distance[:, wall].isfinite()
+            if not bool(seen.any()):
+                break
+            position = self._meet(
+                position, distance[:, wall].where(seen, 0.0), bearing[:, wall], seen, learns
+            )
+        correction = position - start
+        return correction[0] if one else correction
+
+    def observe_position(self, position_m: Tensor, seen_at_m: Tensor, sigma_m: float) -> Tensor:
+        """Take in a position that something else tells, as a view does.
+
+        Args:
+            position_m: Where the animal believes to be, ``([batch,] 2)``.
+            seen_at_m: Where it is said to be, the same shape.
+            sigma_m: Error of that.
+
+        Returns:
+            The displacement that corrects the belief, ``([batch,] 2)``.
+        """
+        self._predict(compass=True)
+        off = (seen_at_m - position_m).to(self.errors).reshape(-1, 2)
+        p = self.covariance
+        spread = p[:, :2, :2] + sigma_m**2 * torch.eye(2, dtype=p.dtype, device=p.device)
+        gain = torch.linalg.solve(spread, p[:, :2, :]).mT
+        change = (gain @ off.unsqueeze(-1)).squeeze(-1)
+        self.covariance = p - gain @ p[:, :2, :]
+        self._apply(change)
+        correction = change[:, :2]
+        return correction[0] if self.batch is None else correction
+
+    def forget_position(self, sigma_m: float) -> None:
+        """Say that the position is unknown but for ``sigma_m``, as after it was set anew."""
+        fresh = self.covariance.clone()
+        fresh[:, :2, :] = 0.0
+        fresh[:, :, :2] = 0.0
+        fresh[:, 0, 0] = fresh[:, 1, 1] = sigma_m**2
+        self.covariance = fresh
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        self.moved_m = torch.zeros_like(self.moved_m)
+        self.spread_m2 = torch.zeros_like(self.spread_m2)
+        self.since.s = self.since.squares_s2 = 0.0
+
+    def _predict(self, compass: bool) -> None:
+        r"""Let the belief spread by the motion since the last look.
+
+        .. math:: P \leftarrow F P F^\top + Q, \qquad
+                  F = I + \Big[-\tfrac{d}{1 - s},\; d^\perp\Big]
+                  \text{ from speed and compass error to position}
+
+        with :math:`d` the way moved; :math:`Q` is along and across each step. The compass error
+        decays in its time, or, if the heading is integrated, does not.
+        """
+        c, p = self.config, self.covariance
+        dt_s = self.since.s
+        scale, _ = self.errors.unbind(-1)
+        d = self.moved_m
+        lever = torch.stack([-d / (1.0 - scale).unsqueeze(-1), d.flip(-1) * d.new_tensor([1, -1])],
+                            dim=-1)  # fmt: skip
+        top = p[:, :2, :] + lever @ p[:, 2:4, :]
+        p = torch.cat([top, p[:, 2:, :]], dim=1)
+        p = torch.cat([p[:, :, :2] + p[:, :, 2:4] @ lever.mT, p[:, :, 2:]], dim=2)
+        along, across = c.speed_factor**2, math.radians(c.heading_white_deg) ** 2
+        total = self.spread_m2.diagonal(dim1=-2, dim2=-1).sum(-1)
+        still = 0.5 * c.speed_add_m_s**2 * self.since.squares_s2 + across * total
+        p[:, :2, :2] += (along - across) * self.spread_m2
+        p[:, 0, 0] += still
+        p[:, 1, 1] += still
+        stays = math.exp(-dt_s / c.heading_slow_s)
+        if compass:
+            p[:, 3, :] *= stays
+            p[:, :, 3] *= stays
+            self.errors = self.errors * self.errors.new_tensor([1.0, stays])
+        p[:, 3, 3] += math.radians(c.heading_slow_deg) ** 2 * (1.0 - stays * stays)
+        self.covariance = p
+        self._start_anew()
+
+    def _meet(
+        self, position: Tensor, distance: Tensor, bearing: Tensor, seen: Tensor, learns: bool
+    ) -> Tensor:
+        """Correct by one wall for each animal that sees one."""
+        c = self.config
+        rows = torch.arange(len(position), device=position.device)
+        bearing = bearing - self.errors[:, 1]
+        slot, known = self._find(position, bearing)
+        missing = seen & ~known
+        if bool(missing.any()):
+            slot, known = self._recall(position, distance, bearing, slot, known, missing, learns)
+        use = seen & known
+        if not bool(use.any()):
+            return position
+        wall = Wall(*self.walls[rows, self.active[rows, slot].clamp_min(0)].unbind(-1))
+        off, normal, lever = wall_innovation(position, distance, bearing, wall)
+        p = self.covariance
+        half = 0.5 * lever
+        moves = (
+            p[rows, OWN + slot] - normal[:, :1] * p[:, 0] - normal[:, 1:] * p[:, 1]
+            - half.unsqueeze(-1) * p[:, 3]
+        )  # fmt: skip
+        variance = (
+            moves[rows, OWN + slot] - normal[:, 0] * moves[:, 0] - normal[:, 1] * moves[:, 1]
+            - half * moves[:, 3] + c.sigma_m**2 + (half * math.radians(c.sigma_deg)).square()
+        )  # fmt: skip
+        self.innovation = torch.maximum(
+            self.innovation, (off.abs() / variance.sqrt()).where(use, 0.0)
+        )
+        use = use & (off.square() < c.gate**2 * variance)
+        gain = (moves / variance.unsqueeze(-1)).where(use.unsqueeze(-1), 0.0)
+        change = gain * off.unsqueeze(-1)
+        self.covariance = p - gain.unsqueeze(-1) * moves.unsqueeze(-2)
+        self._apply(change)
+        return position + change[:, :2]
+
+    def _apply(self, change: Tensor) -> None:
+        """Change the learnt errors and the remembered distances."""
+        self.errors = self.errors + change[:, 2:OWN]
+        at = self.active.clamp_min(0)
+        column = Wall._fields.index("distance_m")
+        if at.shape[1]:
+            more = change[:, OWN:].where(self.active >= 0, 0.0)
+            walls = self.walls.clone()
+            walls[..., column] = walls[..., column].scatter_add(1, at, more)
+            self.walls = walls
+
+    def _find(self, position: Tensor, bearing: Tensor) -> tuple[Tensor, Tensor]:
+        """Find the active wall that each animal looks at: slot, and whether there is one."""
+        if self.active.shape[1] == 0:
+            none = torch.zeros(len(position), dtype=torch.int64, device=position.device)
+            return none, none.bool()
+        at = self.active.clamp_min(0).unsqueeze(-1).expand(-1, -1, self.walls.shape[-1])
+        cost = self._unlike(self.walls.gather(1, at), position, bearing)
+        least, slot = cost.where(self.active >= 0, math.inf).min(1)
+        return slot, least < 1.0
+
+    def _unlike(self, walls: Tensor, position: Tensor, bearing: Tensor) -> Tensor:
+        c = self.config
+        away = (walls[..., :2] - position.unsqueeze(-2)).square().sum(-1) / c.spread_m**2
+        turned = wrap(walls[..., 2] - bearing.unsqueeze(-1)) / math.radians(c.spread_deg)
+        return away + turned.square()
+
+    def _recall(
+        self, position: Tensor, distance: Tensor, bearing: Tensor,
+        slot: Tensor, known: Tensor, missing: Tensor, learns: bool,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Make active what is remembered of the walls that were not found, or remember them."""
+        slot, known = slot.clone(), known.clone()
+        for row in missing.nonzero()[:, 0].tolist():  # rare: a wall is new, or long not seen
+            n = int(self.n_walls[row])
+            stored = self.walls[row, :n]
+            cost = self._unlike(stored, position[row], bearing[row])
+            cost[self.active[row][self.active[row] >= 0]] = math.inf
+            wall = int(cost.argmin()) if n else -1
+            if n == 0 or cost[wall] >= 1.0:
+                if not learns:
+                    continue
+                wall = n
+                self._remember(row, torch.stack([*position[row], bearing[row], distance[row],
+                                                 position.new_tensor(_UNKNOWN_M2)]))  # fmt: skip
+            slot[row], known[row] = self._activate(row, wall, position[row]), True
+        return slot, known
+
+    def _remember(self, row: int, wall: Tensor) -> None:
+        n = int(self.n_walls[row])
+        walls = self.walls
+        if n == walls.shape[1]:
+            walls = torch.cat([walls, walls.new_zeros(len(walls), max(16, n), walls.shape[2])], 1)
+        else:
+            walls = walls.clone()
+        walls[row, n] = wall
+        self.walls = walls
+        self.n_walls = self.n_walls.clone()
+        self.n_walls[row] += 1
+
+    def _activate(self, row: int, wall: int, position: Tensor) -> int:
+        """Give a wall a place in the covariance; the farthest one makes room."""
+        free = (self.active[row] < 0).nonzero()
+        width = self.active.shape[1]
+        if len(free):
+            slot = int(free[0])
+        elif width < ACTIVE:
+            slot = width
+            more = min(max(16, width), ACTIVE - width)
+            self.active = torch.nn.functional.pad(self.active, (0, more), value=-1)
+            self.covariance = torch.nn.functional.pad(self.covariance, (0, more, 0, more))
+        else:
+            anchors = self.walls[row, self.active[row], :2]
+            slot = int((anchors - position).square().sum(-1).argmax())
+            self.walls = self._up_to_date()
+        covariance, active = self.covariance.clone(), self.active.clone()
+        covariance[row, OWN + slot, :] = 0.0
+        covariance[row, :, OWN + slot] = 0.0
+        covariance[row, OWN + slot, OWN + slot] = self.walls[row, wall, 4]
+        active[row, slot] = wall
+        self.covariance, self.active = covariance, active
+        return slot
+
+    def _up_to_date(self) -> Tensor:
+        """Return the remembered walls with the variances that the covariance has of them."""
+        walls = self.walls.clone()
+        row, slot = (self.active >= 0).nonzero(as_tuple=True)
+        own = self.covariance.diagonal(dim1=-2, dim2=-1)[:, OWN:]
+        walls[row, self.active[row, slot], 4] = own[row, slot]
+        return walls
+
+
+def _take_sizes(
+    module: torch.nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    for name in ("walls", "active", "covariance"):
+        saved = state.get(prefix + name)
+        if saved is not None and len(saved) == len(getattr(module, name)):
+            setattr(module, name, getattr(module, name).new_empty(saved.shape))

@@ -1,0 +1,308 @@
+"""Walls in a lidar's scan: the feet of the perpendiculars, as boundary cells need them.
+
+A window slides over the beams and is fitted with a line; where the foot of the perpendicular on
+that line lies among the window's own points there may be a wall, straight or curved. The points
+that agree with it are gathered and fitted once more, with a parabola if they bend.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neuroslam.errors import BadFrame
+from neuroslam.geometry import TWO_PI, wrap_angles
+
+_WINDOW_M = 0.06  # half the window: in it a corner of 90 degrees shows, and a pillar is still flat
+_WALL_M = 0.25  # half of the most that is fitted of one wall
+_FEWEST = 5  # points of a wall
+_OUTLIER = 3.0  # tolerances
+_SIGNIFICANT = 3.0  # standard deviations of a coefficient
+_ROUNDS = 4
+
+
+class _Points(NamedTuple):
+    """The scan unrolled by a third of a turn at both ends, so that no window has to wrap.
+
+    Attributes:
+        xy: Metres, ahead is x, ``(2, m)``; zero where the beam found nothing.
+        seen: 1 where it found something, ``(m,)``.
+        first: First beam of the surface that each beam is on, ``(m,)``.
+        last: Its last one.
+        pad: Beams before the first of the scan.
+        step: Angle from beam to beam.
+    """
+
+    xy: np.ndarray
+    seen: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    pad: int
+    step: float
+
+
+class _Wall(NamedTuple):
+    """Distance and bearing of the foot, and the unrolled beams that are on the wall."""
+
+    distance_m: float
+    bearing_rad: float
+    first: int
+    last: int
+
+
+class _Curve(NamedTuple):
+    """Coefficients of a fitted wall in the frame of its foot, RMS misfit, degrees of freedom."""
+
+    q: tuple[float, float, float]
+    rms: float
+    free: int
+
+
+def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) -> np.ndarray:
+    """Find the walls in a scan: the feet of the perpendiculars on them.
+
+    A corner that stands out is the nearest point of its surroundings too, but its sides slope on
+    from it, and it is not taken; nor is a wall whose foot lies beyond what is seen of it.
+
+    Args:
+        ranges: Metres, ``(n,)``, at bearings evenly over the full turn, counter-clockwise from
+            straight ahead; ``inf`` where nothing is in reach.
+        reach_m: Only walls so near. Let the lidar reach farther, for a wall is known by its points
+            on both sides of the foot.
+        tolerance_m: Standard deviation of the ranges' noise. What is bent by less than that may
+            pass for straight.
+
+    Returns:
+        Distance in metres and bearing relative to the heading in [-pi, pi), ``(m, 2)``, nearest
+        first.
+
+    Raises:
+        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or holds NaN or negative
+            ranges; if the reach or the tolerance is not above zero.
+
+    Example:
+        >>> beams = 2 * np.pi * np.arange(180) / 180
+        >>> ahead = np.where(np.cos(beams) > 0.1, 0.2 / np.cos(beams), np.inf)
+        >>> walls_in_scan(ahead, reach_m=0.3).round(3).tolist()
+        [[0.2, 0.0]]
+    """
+    scan = _checked(ranges, reach_m, tolerance_m)
+    found: list[_Wall] = []
+    if scan.min() > reach_m + _OUTLIER * tolerance_m:
+        return np.empty((0, 2))
+    points = _unrolled(scan, tolerance_m)
+    misfit, distance, bearing = _slide(points, scan, reach_m, tolerance_m)
+    n, pad = len(scan), points.pad
+    while misfit[seed := int(misfit.argmin())] < np.inf:
+        wall = _gather(points, pad + seed, distance[seed], bearing[seed], tolerance_m)
+        if wall is None or wall.distance_m > reach_m:
+            spent = np.arange(seed - 1, seed + 2)
+        else:
+            spent = np.arange(wall.first - pad, wall.last + 1 - pad)
+            if not any(_same(wall, other, n) for other in found):
+                found.append(wall)
+        misfit[spent % n] = np.inf
+    return np.array(sorted(wall[:2] for wall in found)).reshape(-1, 2)
+
+
+def _checked(ranges: ArrayLike, reach_m: float, tolerance_m: float) -> np.ndarray:
+    scan = np.asarray(ranges, dtype=np.float64)
+    if scan.ndim != 1 or len(scan) < 8:
+        raise BadFrame(f"scan: has the shape {scan.shape}; expected (n,), at least 8 beams")
+    if not scan.min() >= 0.0:  # NaN too
+        at = int(np.flatnonzero(~(scan >= 0.0))[0])
+        raise BadFrame(
+            f"scan: beam {at} measures {scan[at]:g} m; expected metres, at least 0, or inf where "
+            "nothing is in reach"
+        )
+    if not (reach_m > 0.0 and 0.0 < tolerance_m < np.inf):
+        raise BadFrame(
+            f"scan: reach_m is {reach_m} and tolerance_m is {tolerance_m}; expected both above 0"
+        )
+    return scan
+
+
+def _unrolled(scan: np.ndarray, tolerance_m: float) -> _Points:
+    n = len(scan)
+    step, pad = TWO_PI / n, n // 3
+    seen = scan < np.inf
+    r = np.where(seen, scan, 0.0)
+    before = np.roll(r, 1)
+    # A wall seen at a slant of up to 75 degrees changes by less than this from beam to beam.
+    parted = np.abs(r - before) > 5.0 * tolerance_m + 4.0 * step * np.minimum(r, before)
+    parted |= ~(seen & np.roll(seen, 1))
+    order = np.arange(-pad, n + pad) % n
+    at, parted = np.arange(len(order)), parted[order]
+    first = np.maximum.accumulate(np.where(parted, at, 0))
+    next_one = np.minimum.accumulate(np.where(parted, at, len(order))[::-1])[::-1]
+    beam = step * np.arange(n)
+    table = np.stack([seen, r * np.cos(beam), r * np.sin(beam)])[:, order]
+    return _Points(table[1:], table[0], first, np.append(next_one[1:], len(order)) - 1, pad, step)
+
+
+def _slide(
+    points: _Points, scan: np.ndarray, reach_m: float, tolerance_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    r"""Fit a line to a window about each beam, by its moments: :math:`p \cdot n(\alpha) = d`.
+
+    The normal is the direction of least variance, :math:`\lambda_- = \tfrac12 (c_{xx} + c_{yy} -
+    \sqrt{(c_{xx} - c_{yy})^2 + 4 c_{xy}^2})`.
+
+    Returns:
+        RMS distance of the window's points from the line, ``inf`` where there is no wall; its
+        distance and bearing; each ``(n,)``.
+    """
+    n, step = len(scan), points.step
+    here = np.flatnonzero(scan <= np.hypot(reach_m, _WINDOW_M) + _OUTLIER * tolerance_m)
+    r = np.maximum(scan[here], tolerance_m)
+    half = np.clip(np.ceil(np.arctan(_WINDOW_M / r) / step), 2, n // 5).astype(np.int64)
+    at = points.pad + here
+    low, high = np.maximum(at - half, points.first[at]), np.minimum(at + half, points.last[at])
+    x, y = points.xy
+    sums = np.zeros((6, len(x) + 1))
+    np.cumsum(np.stack([points.seen, x, y, x * x, x * y, y * y]), axis=1, out=sums[:, 1:])
+    count, *moments = sums[:, high + 1] - sums[:, low]
+    count = np.maximum(count, 1.0)
+    x, y, xx, xy, yy = np.stack(moments) / count
+    xx, xy2, yy = xx - x * x, 2.0 * (xy - x * y), yy - y * y
+    normal = 0.5 * (np.arctan2(xy2, xx - yy) + np.pi)
+    d = x * np.cos(normal) + y * np.sin(normal)
+    least = 0.5 * (xx + yy - np.hypot(xx - yy, xy2))
+    bearing = normal + np.pi * (d < 0.0)
+    free = np.maximum(count - 2.0, 1.0)
+    rms = np.sqrt(np.maximum(least, 0.0) * count / free)
+    off = np.abs(wrap_angles(bearing - step * (0.5 * (low + high) - points.pad)))
+    good = (count >= _FEWEST) & (rms <= _allowed(tolerance_m, free))
+    good &= (np.abs(d) <= reach_m + 2.0 * tolerance_m) & (off <= step * (0.5 * (high - low) + 0.5))
+    misfit, distances, bearings = np.full(n, np.inf), np.zeros(n), np.zeros(n)
+    misfit[here], distances[here], bearings[here] = np.where(good, rms, np.inf), np.abs(d), bearing
+    return misfit, distances, bearings
+
+
+def _gather(
+    points: _Points, seed: int, distance_m: float, bearing_rad: float, tolerance_m: float
+) -> _Wall | None:
+    r"""Gather the points about a beam that are on one wall, and fit them.
+
+    In the frame of the foot, u along the wall and v beyond it, the wall is
+    :math:`v = q_0 + q_1 u + q_2 u^2`, with :math:`q_2` only if it is significant. Points count for
+    :math:`1 - (e / 3\sigma)^2`. A corner, :math:`v = q_0 + q_1 u + q_2 |u|` with :math:`q_2 > 0`,
+    is no wall.
+    """
+    reach = (len(points.seen) - 2 * points.pad) // 3
+    start = max(int(points.first[seed]), seed - reach)
+    x, y = points.xy[:, start : min(int(points.last[seed]), seed + reach) + 1]
+    bend, limit, ends = 0.0, _OUTLIER * tolerance_m, (0, 0)
+    for _ in range(_ROUNDS):
+        c, s = math.cos(bearing_rad), math.sin(bearing_rad)
+        u, v = c * y - s * x, c * x + s * y - distance_m
+        share = 1.0 - ((v - bend * u * u) / limit) ** 2
+        stray = np.flatnonzero((share < 0.0) | (np.abs(u) > _WALL_M))
+        k = int(stray.searchsorted(seed - start))
+        low = int(stray[k - 1]) + 1 if k else 0
+        high = int(stray[k]) if k < len(stray) else len(u)
+        if high - low < _FEWEST or low > seed - start:
+            return None
+        u, v = u[low:high], v[low:high]
+        rows = np.stack([np.ones(high - low), u, u * u, np.abs(u), v])
+        curve, corner = _fit(((rows * share[low:high]) @ rows.T).tolist(), high - low)
+        if curve is None:
+            return None
+        q0, q1, q2 = curve.q
+        foot = _foot(distance_m + q0, q1, q2)
+        if foot is None:
+            return None
+        along, off = foot
+        pitch = off * points.step
+        inside = u[0] - pitch <= along <= u[-1] + pitch
+        distance_m, bearing_rad = math.hypot(along, off), bearing_rad + math.atan2(along, off)
+        bend = q2
+        settled, ends = ends == (low, high), (low, high)
+        if settled and abs(along) < 0.1 * tolerance_m:
+            break
+    if corner or not inside or curve.rms > _allowed(tolerance_m, curve.free):
+        return None
+    bearing_rad = (bearing_rad + math.pi) % TWO_PI - math.pi
+    return _Wall(distance_m, bearing_rad, start + low, start + high - 1)
+
+
+def _fit(table: list[list[float]], count: int) -> tuple[_Curve | None, bool]:
+    """Fit line, parabola and corner by their moments; return the wall, and whether it is a corner.
+
+    Args:
+        table: Weighted products of 1, u, u^2, |u| and v, ``(5, 5)``.
+        count: Points in it.
+    """
+    (s, su, suu, sa, sv), (_, _, suuu, sua, suv), (_, _, s4, _, suuv), (*_, saa, sav), _ = table
+    svv = table[4][4]
+    det = s * suu - su * su
+    if det <= 1e-12 * s * suu:
+        return None, False
+    q0, q1 = (suu * sv - su * suv) / det, (s * suv - su * sv) / det
+    curve = _curve((q0, q1, 0.0), svv - q0 * sv - q1 * suv, count - 2)
+    if count < _FEWEST + 3:
+        return curve, False
+    # The third coefficient, by what its column has that a line has not.
+    bent = _third(det, (s, su, suu), (suu, suuu, s4), (sv, suv, suuv), svv, count)
+    kinked = _third(det, (s, su, suu), (sa, sua, saa), (sv, suv, sav), svv, count)
+    if bent is not None:
+        curve = bent
+    corner = (
+        kinked is not None
+        and kinked.q[2] > 0.0
+        and kinked.rms * (count - 3) < (curve.rms * (count - 3))
+    )
+    return curve, corner
+
+
+def _third(
+    det: float,
+    line: tuple[float, float, float],
+    column: tuple[float, float, float],
+    target: tuple[float, float, float],
+    svv: float,
+    count: int,
+) -> _Curve | None:
+    """Fit 1, u and a third column; ``None`` if that is not significant."""
+    s, su, suu = line
+    c0, c1, cc = column
+    v0, v1, vc = target
+    a0, a1 = (suu * c0 - su * c1) / det, (s * c1 - su * c0) / det
+    own = cc - a0 * c0 - a1 * c1
+    if own <= 1e-9 * cc:
+        return None
+    q2 = (vc - a0 * v0 - a1 * v1) / own
+    b0, b1 = (suu * v0 - su * v1) / det, (s * v1 - su * v0) / det
+    q = b0 - a0 * q2, b1 - a1 * q2, q2
+    curve = _curve(q, svv - q[0] * v0 - q[1] * v1 - q2 * vc, count - 3)
+    return curve if abs(q2) * math.sqrt(own) > _SIGNIFICANT * curve.rms else None
+
+
+def _curve(q: tuple[float, float, float], squares: float, free: int) -> _Curve:
+    return _Curve(q, math.sqrt(max(squares, 0.0) / free), free)
+
+
+def _foot(q0: float, q1: float, q2: float) -> tuple[float, float] | None:
+    """Find the nearest point of a parabola, by Newton's rule; ``None`` if it is no nearest one."""
+    along = 0.0
+    for _ in range(3):
+        off, slope = q0 + (q1 + q2 * along) * along, q1 + 2.0 * q2 * along
+        rise = 1.0 + slope * slope + 2.0 * q2 * off
+        if rise < 0.1:
+            return None
+        along -= (along + off * slope) / rise
+    return along, q0 + (q1 + q2 * along) * along
+
+
+def _allowed(tolerance_m: float, free: np.ndarray) -> np.ndarray:
+    """RMS misfit that a wall exceeds in one case of a hundred, by so many degrees of freedom."""
+    return tolerance_m * (1.0 + 2.5 / np.sqrt(2.0 * free))
+
+
+def _same(wall: _Wall, other: _Wall, n: int) -> bool:
+    """Tell whether the foot of one is on the other's points: two readings of one wall."""
+    return any(
+        ((a.bearing_rad / TWO_PI * n + n // 3 - b.first + 0.5) % n) <= b.last - b.first + 1
+        for a, b in ((wall, other), (other, wall))
+    )
