@@ -51,7 +51,9 @@ def noisy_scans(arena: Arena, n: int) -> np.ndarray:
     return np.maximum(ranges + rng.normal(0.0, 0.01, ranges.shape), 0.0)
 
 
-@pytest.mark.parametrize("arena", [Arena.regular(50, 1.0), Arena.rooms(12)], ids=["convex", "rooms"])
+@pytest.mark.parametrize(
+    "arena", [Arena.regular(50, 1.0), Arena.rooms(12)], ids=["convex", "rooms"]
+)
 def test_walls_near(benchmark, arena):
     benchmark(arena.walls_near, places(arena, N), REACH_M)
 

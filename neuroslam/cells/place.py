@@ -135,7 +135,7 @@ class CompetitiveHebbianPlaceCells(Running):
         self._near = None
 
     def forward(
-        self, grid: Tensor, position_m: Tensor, dt_s: float, *, learns: bool = True
+        self, grid: Tensor, position_m: Tensor, dt_s: float, *, learns: Tensor | None = None
     ) -> PlaceResponse:
         """Let the cells compete; recruit one where none is near, and let the winner learn.
 
@@ -143,7 +143,8 @@ class CompetitiveHebbianPlaceCells(Running):
             grid: Rates of the grid cells, ``([batch,] n_grid)``.
             position_m: Position that the phases of the grid tell, ``([batch,] 2)``.
             dt_s: Time since the last step.
-            learns: Recruit and learn; else only respond.
+            learns: Who recruits and learns, ``(batch or 1,)``; the others only respond. ``None``:
+                all.
         """
         one = self.batch is None
         grid = (grid[None] if one else grid).detach().to(self.weights)
@@ -156,19 +157,20 @@ class CompetitiveHebbianPlaceCells(Running):
         winner = self.window.gather(1, best)[:, 0]
         away = (centres - position.unsqueeze(1)).square().sum(-1)
         recruited = away.amin(-1) >= c.threshold_m**2
-        if learns:
-            if bool(recruited.any()):
-                winner = self._recruit(recruited, grid, position, winner)
-            if c.hebbian_rate:
-                self._learn(grid, winner, best, ~recruited)
-        else:
-            recruited = torch.zeros_like(recruited)
-            winner = winner.where(self.n_cells > 0, _NO_CELL)
+        if learns is None:
+            learns = torch.ones_like(recruited)
+        recruited = recruited & learns
+        if bool(recruited.any()):
+            winner = self._recruit(recruited, grid, position, winner)
+        winner = winner.where(self.n_cells > 0, _NO_CELL)
+        if c.hebbian_rate:
+            self._learn(grid, winner, best, learns & ~recruited)
         changed = winner != self.winner
-        if learns:
-            if bool(changed.any()):
-                self._enter(changed, winner)
-            self.time_s.scatter_add_(1, winner.unsqueeze(1), torch.full_like(position[:, :1], dt_s))
+        enters = changed & learns
+        if bool(enters.any()):
+            self._enter(enters, winner)
+        stays = (learns * dt_s).to(self.time_s)
+        self.time_s.scatter_add_(1, winner.clamp_min(0)[:, None], stays[:, None])
         self.winner = winner
         result = PlaceResponse(winner, recruited, changed)
         return PlaceResponse(*(part[0] for part in result)) if one else result
@@ -253,9 +255,9 @@ class CompetitiveHebbianPlaceCells(Running):
         before = near.gather(1, at)
         after = hebbian_step(before, grid.unsqueeze(1), self.config.hebbian_rate)
         after = after.where(which[:, None, None], before)
-        near.scatter_(1, at, after.where(which[:, None, None], near.gather(1, at)))
-        rows = torch.arange(len(winner), device=winner.device)[which]
-        self.weights[rows, winner[which]] = after[which, 0]
+        near.scatter_(1, at, after)
+        rows = which.nonzero()[:, 0]
+        self.weights[rows, winner[rows]] = after[rows, 0]
 
     def _enter(self, changed: Tensor, winner: Tensor) -> None:
         rows = changed.nonzero()[:, 0]

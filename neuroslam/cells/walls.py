@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroslam.cells.boundary import check_walls
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
@@ -143,16 +142,8 @@ class WallMemory(Running):
             speed_m_s: Measured speed, ``([batch])``.
             heading_rad: Measured heading, ``([batch])``.
             dt_s: For how long.
-
-        Raises:
-            BadFrame: If speed or heading are not finite.
         """
         speed_m_s, heading_rad = speed_m_s.to(self.errors), heading_rad.to(self.errors)
-        if not bool((speed_m_s.isfinite() & heading_rad.isfinite()).all()):
-            raise BadFrame(
-                f"motion: speed {speed_m_s.reshape(-1).tolist()[:3]} m/s, heading "
-                f"{heading_rad.reshape(-1).tolist()[:3]} rad; expected finite numbers"
-            )
         scale, compass = self.errors.unbind(-1)
         heading = heading_rad - compass
         length = speed_m_s * dt_s * (1.0 - scale)
@@ -170,7 +161,7 @@ class WallMemory(Running):
         bearing_rad: Tensor,
         *,
         compass: bool = True,
-        learns: bool = True,
+        learns: Tensor | None = None,
     ) -> Tensor:
         """Take in the walls around; returns by how much the position is corrected.
 
@@ -180,15 +171,11 @@ class WallMemory(Running):
                 ``([batch,] n_walls)``; ``inf`` where there is none.
             bearing_rad: Its bearing in the world as measured: heading plus bearing from it.
             compass: The heading is measured, so its error stays bounded; else it is integrated.
-            learns: Remember walls that are new.
+            learns: Who remembers walls that are new, ``(batch or 1,)``; ``None``: all.
 
         Returns:
             Displacement in metres, ``([batch,] 2)``.
-
-        Raises:
-            BadFrame: If a distance is negative or NaN, or a bearing not finite.
         """
-        check_walls(distance_m, bearing_rad)
         one = self.batch is None
         position = (position_m[None] if one else position_m).to(self.errors)
         if self.since.s < self.config.period_s - 1e-9:
@@ -237,9 +224,10 @@ class WallMemory(Running):
         fresh[:, :, :2] = 0.0
         fresh[:, 0, 0] = fresh[:, 1, 1] = sigma_m**2
         self.covariance = fresh
-        self._start_anew()
+        self.start_anew()
 
-    def _start_anew(self) -> None:
+    def start_anew(self) -> None:
+        """Forget the motion since the last look."""
         self.moved_m = torch.zeros_like(self.moved_m)
         self.spread_m2 = torch.zeros_like(self.spread_m2)
         self.since.s = self.since.squares_s2 = 0.0
@@ -276,10 +264,15 @@ class WallMemory(Running):
             self.errors = self.errors * self.errors.new_tensor([1.0, stays])
         p[:, 3, 3] += math.radians(c.heading_slow_deg) ** 2 * (1.0 - stays * stays)
         self.covariance = p
-        self._start_anew()
+        self.start_anew()
 
     def _meet(
-        self, position: Tensor, distance: Tensor, bearing: Tensor, seen: Tensor, learns: bool
+        self,
+        position: Tensor,
+        distance: Tensor,
+        bearing: Tensor,
+        seen: Tensor,
+        learns: Tensor | None,
     ) -> Tensor:
         """Correct by one wall for each animal that sees one."""
         c = self.config
@@ -343,7 +336,7 @@ class WallMemory(Running):
 
     def _recall(
         self, position: Tensor, distance: Tensor, bearing: Tensor,
-        slot: Tensor, known: Tensor, missing: Tensor, learns: bool,
+        slot: Tensor, known: Tensor, missing: Tensor, learns: Tensor | None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Make active what is remembered of the walls that were not found, or remember them."""
         slot, known = slot.clone(), known.clone()
@@ -354,7 +347,7 @@ class WallMemory(Running):
             cost[self.active[row][self.active[row] >= 0]] = math.inf
             wall = int(cost.argmin()) if n else -1
             if n == 0 or cost[wall] >= 1.0:
-                if not learns:
+                if learns is not None and not learns[row]:
                     continue
                 wall = n
                 self._remember(row, torch.stack([*position[row], bearing[row], distance[row],
@@ -404,6 +397,26 @@ class WallMemory(Running):
         own = self.covariance.diagonal(dim1=-2, dim2=-1)[:, OWN:]
         walls[row, self.active[row, slot], 4] = own[row, slot]
         return walls
+
+
+def check_motion(speed_m_s: Tensor, heading_rad: Tensor) -> None:
+    """Refuse speeds and headings that are not finite.
+
+    Raises:
+        BadFrame: If one is not.
+
+    Example:
+        >>> check_motion(torch.tensor(0.1), torch.tensor(float("nan")))
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: motion: speed 0.1 m/s, heading nan rad; expected finite numbers
+    """
+    finite = speed_m_s.isfinite() & heading_rad.isfinite()
+    if not bool(finite.all()):
+        speeds, headings = torch.broadcast_tensors(speed_m_s, heading_rad)
+        raise BadFrame(
+            f"motion: speed {speeds[~finite][0].item():g} m/s, heading "
+            f"{headings[~finite][0].item():g} rad; expected finite numbers"
+        )
 
 
 def _take_sizes(

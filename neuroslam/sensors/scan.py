@@ -18,7 +18,8 @@ _WINDOW_M = 0.06  # half the window: in it a corner of 90 degrees shows, and a p
 _WALL_M = 0.25  # half of the most that is fitted of one wall
 _FEWEST = 5  # points of a wall
 _OUTLIER = 3.0  # tolerances
-_SIGNIFICANT = 3.0  # standard deviations of a coefficient
+_BENT, _SHARP = 2.5, 3.0  # standard deviations that tell a curve, a corner from a line
+_ALIKE_RAD = 0.5  # walls that differ by less and share points are one
 _ROUNDS = 4
 
 
@@ -27,7 +28,7 @@ class _Points(NamedTuple):
 
     Attributes:
         xy: Metres, ahead is x, ``(2, m)``; zero where the beam found nothing.
-        seen: 1 where it found something, ``(m,)``.
+        seen: Whether it found something, ``(m,)``.
         first: First beam of the surface that each beam is on, ``(m,)``.
         last: Its last one.
         pad: Beams before the first of the scan.
@@ -128,7 +129,7 @@ def _unrolled(scan: np.ndarray, tolerance_m: float) -> _Points:
     step, pad = TWO_PI / n, n // 3
     seen = scan < np.inf
     r = np.where(seen, scan, 0.0)
-    before = np.roll(r, 1)
+    before = np.concatenate([r[-1:], r[:-1]])
     # A wall seen at a slant of up to 75 degrees changes by less than this from beam to beam.
     parted = np.abs(r - before) > 5.0 * tolerance_m + 4.0 * step * np.minimum(r, before)
     parted |= ~(seen & np.roll(seen, 1))
@@ -137,8 +138,11 @@ def _unrolled(scan: np.ndarray, tolerance_m: float) -> _Points:
     first = np.maximum.accumulate(np.where(parted, at, 0))
     next_one = np.minimum.accumulate(np.where(parted, at, len(order))[::-1])[::-1]
     beam = step * np.arange(n)
-    table = np.stack([seen, r * np.cos(beam), r * np.sin(beam)])[:, order]
-    return _Points(table[1:], table[0], first, np.append(next_one[1:], len(order)) - 1, pad, step)
+    xy = np.empty((2, n))
+    np.multiply(r, np.cos(beam), out=xy[0])
+    np.multiply(r, np.sin(beam), out=xy[1])
+    last = np.append(next_one[1:], len(order)) - 1
+    return _Points(xy[:, order], seen[order], first, last, pad, step)
 
 
 def _slide(
@@ -161,10 +165,11 @@ def _slide(
     low, high = np.maximum(at - half, points.first[at]), np.minimum(at + half, points.last[at])
     x, y = points.xy
     sums = np.zeros((6, len(x) + 1))
-    np.cumsum(np.stack([points.seen, x, y, x * x, x * y, y * y]), axis=1, out=sums[:, 1:])
+    for row, value in zip(sums, (points.seen, x, y, x * x, x * y, y * y), strict=True):
+        np.cumsum(value, out=row[1:])
     count, *moments = sums[:, high + 1] - sums[:, low]
     count = np.maximum(count, 1.0)
-    x, y, xx, xy, yy = np.stack(moments) / count
+    x, y, xx, xy, yy = (moment / count for moment in moments)
     xx, xy2, yy = xx - x * x, 2.0 * (xy - x * y), yy - y * y
     normal = 0.5 * (np.arctan2(xy2, xx - yy) + np.pi)
     d = x * np.cos(normal) + y * np.sin(normal)
@@ -202,11 +207,14 @@ def _gather(
         k = int(stray.searchsorted(seed - start))
         low = int(stray[k - 1]) + 1 if k else 0
         high = int(stray[k]) if k < len(stray) else len(u)
-        if high - low < _FEWEST or low > seed - start:
+        if high - low < _FEWEST or not low <= seed - start < high:
             return None
         u, v = u[low:high], v[low:high]
-        rows = np.stack([np.ones(high - low), u, u * u, np.abs(u), v])
-        curve, corner = _fit(((rows * share[low:high]) @ rows.T).tolist(), high - low)
+        rows = np.empty((5, high - low))
+        rows[0], rows[1], rows[4] = 1.0, u, v
+        np.multiply(u, u, out=rows[2])
+        np.abs(u, out=rows[3])
+        curve, corner = _fit(((rows * share[low:high]) @ rows.T).tolist(), high - low, tolerance_m)
         if curve is None:
             return None
         q0, q1, q2 = curve.q
@@ -218,21 +226,22 @@ def _gather(
         inside = u[0] - pitch <= along <= u[-1] + pitch
         distance_m, bearing_rad = math.hypot(along, off), bearing_rad + math.atan2(along, off)
         bend = q2
-        settled, ends = ends == (low, high), (low, high)
-        if settled and abs(along) < 0.1 * tolerance_m:
+        if ends == (low, high):
             break
+        ends = low, high
     if corner or not inside or curve.rms > _allowed(tolerance_m, curve.free):
         return None
     bearing_rad = (bearing_rad + math.pi) % TWO_PI - math.pi
     return _Wall(distance_m, bearing_rad, start + low, start + high - 1)
 
 
-def _fit(table: list[list[float]], count: int) -> tuple[_Curve | None, bool]:
+def _fit(table: list[list[float]], count: int, tolerance_m: float) -> tuple[_Curve | None, bool]:
     """Fit line, parabola and corner by their moments; return the wall, and whether it is a corner.
 
     Args:
         table: Weighted products of 1, u, u^2, |u| and v, ``(5, 5)``.
         count: Points in it.
+        tolerance_m: Their noise.
     """
     (s, su, suu, sa, sv), (_, _, suuu, sua, suv), (_, _, s4, _, suuv), (*_, saa, sav), _ = table
     svv = table[4][4]
@@ -243,17 +252,11 @@ def _fit(table: list[list[float]], count: int) -> tuple[_Curve | None, bool]:
     curve = _curve((q0, q1, 0.0), svv - q0 * sv - q1 * suv, count - 2)
     if count < _FEWEST + 3:
         return curve, False
-    # The third coefficient, by what its column has that a line has not.
-    bent = _third(det, (s, su, suu), (suu, suuu, s4), (sv, suv, suuv), svv, count)
-    kinked = _third(det, (s, su, suu), (sa, sua, saa), (sv, suv, sav), svv, count)
-    if bent is not None:
-        curve = bent
-    corner = (
-        kinked is not None
-        and kinked.q[2] > 0.0
-        and kinked.rms * (count - 3) < (curve.rms * (count - 3))
-    )
-    return curve, corner
+    bent, q2_std = _third(det, (s, su, suu), (suu, suuu, s4), (sv, suv, suuv), svv, count)
+    kinked, kink_std = _third(det, (s, su, suu), (sa, sua, saa), (sv, suv, sav), svv, count)
+    sharp = kinked.q[2] > _SHARP * kink_std * kinked.rms and kinked.rms < bent.rms
+    # Bent only if the noise does not explain it: else a wall would bend round the next corner.
+    return bent if abs(bent.q[2]) > _BENT * q2_std * tolerance_m else curve, sharp
 
 
 def _third(
@@ -263,20 +266,18 @@ def _third(
     target: tuple[float, float, float],
     svv: float,
     count: int,
-) -> _Curve | None:
-    """Fit 1, u and a third column; ``None`` if that is not significant."""
+) -> tuple[_Curve, float]:
+    """Fit 1, u and a third column; return its coefficient's deviation too, for noise of 1 m."""
     s, su, suu = line
     c0, c1, cc = column
     v0, v1, vc = target
     a0, a1 = (suu * c0 - su * c1) / det, (s * c1 - su * c0) / det
-    own = cc - a0 * c0 - a1 * c1
-    if own <= 1e-9 * cc:
-        return None
+    own = max(cc - a0 * c0 - a1 * c1, 1e-9 * cc)  # what it has that no line has
     q2 = (vc - a0 * v0 - a1 * v1) / own
-    b0, b1 = (suu * v0 - su * v1) / det, (s * v1 - su * v0) / det
-    q = b0 - a0 * q2, b1 - a1 * q2, q2
-    curve = _curve(q, svv - q[0] * v0 - q[1] * v1 - q2 * vc, count - 3)
-    return curve if abs(q2) * math.sqrt(own) > _SIGNIFICANT * curve.rms else None
+    q0 = (suu * v0 - su * v1) / det - a0 * q2
+    q1 = (s * v1 - su * v0) / det - a1 * q2
+    curve = _curve((q0, q1, q2), svv - q0 * v0 - q1 * v1 - q2 * vc, count - 3)
+    return curve, 1.0 / math.sqrt(own)
 
 
 def _curve(q: tuple[float, float, float], squares: float, free: int) -> _Curve:
@@ -301,8 +302,9 @@ def _allowed(tolerance_m: float, free: np.ndarray) -> np.ndarray:
 
 
 def _same(wall: _Wall, other: _Wall, n: int) -> bool:
-    """Tell whether the foot of one is on the other's points: two readings of one wall."""
-    return any(
-        ((a.bearing_rad / TWO_PI * n + n // 3 - b.first + 0.5) % n) <= b.last - b.first + 1
+    """Tell whether two walls face alike and the foot of one is on the other's points."""
+    turn = (wall.bearing_rad - other.bearing_rad + math.pi) % TWO_PI - math.pi
+    return abs(turn) < _ALIKE_RAD and any(
+        (a.bearing_rad / TWO_PI * n + n // 3 - b.first + 0.5) % n <= b.last - b.first + 1
         for a, b in ((wall, other), (other, wall))
     )

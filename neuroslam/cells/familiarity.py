@@ -1,0 +1,140 @@
+"""Familiarity: what walls each place cell has felt, and whether those felt now contradict it."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.config import BoundaryCellConfig
+from neuroslam.geometry import TWO_PI
+from neuroslam.population import Running
+
+_NEAR = 0.6  # share of the reach within which a wall cannot be overlooked
+_NEVER, _ALWAYS = 0.02, 0.98
+_SLACK_BINS = 2  # bearings may be off by so many boundary cells
+_FAMILIAR_S = 1.0
+_FORGIVEN_S = 20.0
+
+
+class Felt(NamedTuple):
+    """Walls felt now, by the bearing of boundary cells: any, and surely near; ``(batch, n)``."""
+
+    any: Tensor
+    near: Tensor
+
+
+def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearings: int) -> Felt:
+    """Sort walls into bins of bearing.
+
+    Args:
+        distance_m: ``(batch, n_walls)``; ``inf`` for none.
+        bearing_rad: In the world, the same shape.
+        reach_m: Farther walls are not felt.
+        n_bearings: Number of bins over the full turn.
+
+    Example:
+        >>> felt = felt_walls(torch.tensor([[0.2, 0.1]]), torch.tensor([[0.0, 3.14]]), 0.3, 4)
+        >>> felt.any.tolist(), felt.near.tolist()
+        ([[1.0, 0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0, 0.0]])
+    """
+    bins = (bearing_rad * (n_bearings / TWO_PI)).round().long().remainder(n_bearings)
+    none = distance_m.new_zeros(len(distance_m), n_bearings)
+    return Felt(
+        none.scatter_reduce(1, bins, (distance_m < reach_m).to(none), "amax"),
+        none.scatter_reduce(1, bins, (distance_m < _NEAR * reach_m).to(none), "amax"),
+    )
+
+
+class Familiarity(Running):
+    r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
+
+    A wall is near where none ever was, or none is felt where one always was: while that lasts,
+    ``doubt_s`` grows by the time, and it fades within 20 s. An animal is ``lost`` when it exceeds
+    ``lost_after_s``, until it has faded to half of that. State: seconds of each place cell with
+    each boundary cell (``felt_s``) and in all (``time_s``); the doubt.
+
+    Args:
+        config: Of the boundary cells.
+        lost_after_s: Doubt of an animal that is lost.
+        batch: Number of animals side by side, or ``None`` for one.
+    """
+
+    felt_s: Tensor
+    time_s: Tensor
+    doubt_s: Tensor
+    lost: Tensor
+    slack: Tensor
+
+    def __init__(
+        self, config: BoundaryCellConfig, lost_after_s: float, batch: int | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.lost_after_s = lost_after_s
+        self.batch = batch
+        b, n = batch or 1, config.n_bearings
+        self.register_buffer("felt_s", torch.zeros(b, 64, 2, n))
+        self.register_buffer("time_s", torch.zeros(b, 64))
+        self.register_buffer("doubt_s", torch.zeros(b))
+        self.register_buffer("lost", torch.zeros(b, dtype=torch.bool))
+        apart = (torch.arange(n)[:, None] - torch.arange(n)).abs()
+        near = torch.minimum(apart, n - apart) <= _SLACK_BINS
+        self.register_buffer("slack", near.float(), persistent=False)
+        self.register_load_state_dict_pre_hook(_take_capacity)
+
+    def forward(
+        self, winner: Tensor, distance_m: Tensor, bearing_rad: Tensor, dt_s: float
+    ) -> Tensor:
+        """Compare the walls around with those known of the place; returns who is lost.
+
+        Args:
+            winner: Number of the place cell that won, ``(batch or 1,)``; -1 for none.
+            distance_m: Distances to walls, ``(batch or 1, n_walls)``; ``inf`` for none.
+            bearing_rad: Their bearings in the world, the same shape.
+            dt_s: Time since the last call.
+        """
+        self._make_room(int(winner.max()))
+        c = self.config
+        felt = felt_walls(distance_m.to(self.felt_s), bearing_rad, c.reach_m, c.n_bearings)
+        rows, cell = torch.arange(len(winner), device=winner.device), winner.clamp_min(0)
+        time = self.time_s[rows, cell]
+        share = self.felt_s[rows, cell] / time.clamp_min(1e-9)[:, None, None]
+        ever, always = share.unbind(1)
+        new = (felt.near * ((ever @ self.slack) < _NEVER)).amax(-1)
+        missing = ((always > _ALWAYS) * ((felt.any @ self.slack) == 0)).amax(-1)
+        surprise = torch.maximum(new, missing) * (time > _FAMILIAR_S) * (winner >= 0)
+        fades = math.exp(-dt_s / _FORGIVEN_S)
+        self.doubt_s = self.doubt_s * fades + dt_s * surprise
+        self.lost = torch.where(
+            self.lost,
+            self.doubt_s > 0.5 * self.lost_after_s,
+            self.doubt_s > self.lost_after_s,
+        )
+        sure = ((surprise == 0) & (winner >= 0) & ~self.lost).to(time) * dt_s
+        self.time_s[rows, cell] = time + sure
+        self.felt_s[rows, cell] += torch.stack(felt, dim=1) * sure[:, None, None]
+        return self.lost
+
+    def n_activated(self) -> Tensor:
+        """Count, for each animal, pairs of a place cell and a boundary cell active at it."""
+        return (self.felt_s[:, :, 0] > 0).sum((1, 2))
+
+    def reset_doubt(self) -> None:
+        """Say that the position is known again."""
+        self.doubt_s, self.lost = torch.zeros_like(self.doubt_s), torch.zeros_like(self.lost)
+
+    def _make_room(self, cell: int) -> None:
+        if cell >= self.time_s.shape[1]:
+            more = max(self.time_s.shape[1], cell + 1 - self.time_s.shape[1])
+            self.time_s = torch.nn.functional.pad(self.time_s, (0, more))
+            self.felt_s = torch.nn.functional.pad(self.felt_s, (0, 0, 0, 0, 0, more))
+
+
+def _take_capacity(
+    module: torch.nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    for name in ("felt_s", "time_s"):
+        saved = state.get(prefix + name)
+        if saved is not None and len(saved) == len(getattr(module, name)):
+            setattr(module, name, getattr(module, name).new_empty(saved.shape))
