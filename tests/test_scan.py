@@ -62,7 +62,7 @@ def compare(arena, noise_m, n=250):
         (named_arena("pentagon"), 0.97, 0.02, 0.006, 3.5),
         (named_arena("nonagon"), 0.94, 0.04, 0.008, 8.0),
         (named_arena("circle2m"), 0.98, 0.05, 0.008, 10.0),
-        (named_arena("circle1m"), 0.97, 0.13, 0.008, 17.0),
+        (named_arena("circle1m"), 0.97, 0.13, 0.010, 17.0),
         (named_arena("two_rooms"), 0.97, 0.02, 0.006, 3.5),
         (named_arena("pillar"), 0.96, 0.02, 0.008, 13.0),
         (BLOCK, 0.97, 0.02, 0.006, 2.5),

@@ -13,6 +13,8 @@ from neuroslam.population import Running
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
 """Zones of the activity of boundary cells, from far to near."""
 
+_FAR_M = 1e3  # where no cell responds; infinity would make gradients of nothing
+
 
 def boundary_zone(distance_m: Tensor, reach_m: float) -> Tensor:
     r"""Tell in which zone an animal is, by its distance :math:`R` to the nearest wall.
@@ -48,8 +50,8 @@ def boundary_activity(
         dt_s: Time since the last step.
 
     Example:
-        >>> boundary_activity(torch.tensor(0.2), torch.tensor(0.1), 0.3, 0.8, 0.5).item()
-        0.466...
+        >>> round(boundary_activity(torch.tensor(0.2), torch.tensor(0.1), 0.3, 0.8, 0.5).item(), 3)
+        0.467
     """
     near = (reach_m - distance_m).clamp(0.0, reach_m) / reach_m
     grows = torch.where(distance_m <= reach_m / 2, rate_per_s * dt_s, -rate_per_s * dt_s)
@@ -86,13 +88,11 @@ def boundary_tuning(
     Returns:
         ``(..., n_bearings, n_distances)``, non-negative.
     """
-    seen = distance_m.isfinite()
-    far = distance_m.where(seen, 0.0).unsqueeze(-1) - preferred_m
+    far = distance_m.clamp_max(_FAR_M).unsqueeze(-1) - preferred_m
     apart = (bearing_rad.unsqueeze(-1) - preferred_rad + math.pi).remainder(TWO_PI) - math.pi
-    width = sigma_m * (preferred_m / beta_m + 1.0)
-    by_distance = (-0.5 * (far / width).square()).exp() * seen.unsqueeze(-1)
+    by_distance = (-0.5 * (far / (sigma_m * (preferred_m / beta_m + 1.0))).square()).exp()
     by_bearing = (-0.5 * (apart / sigma_rad).square()).exp()
-    return by_bearing.transpose(-1, -2) @ by_distance
+    return by_bearing.mT @ by_distance
 
 
 class BoundaryCells(Running):
@@ -148,6 +148,10 @@ class BoundaryCells(Running):
             BadFrame: If a distance is negative or NaN, or a bearing of a wall not finite.
         """
         check_walls(distance_m, bearing_rad)
+        return self.respond(distance_m, bearing_rad, dt_s)
+
+    def respond(self, distance_m: Tensor, bearing_rad: Tensor, dt_s: float) -> Tensor:
+        """Do as :meth:`forward` with walls that were checked."""
         distance_m, bearing_rad = distance_m.to(self.activity), bearing_rad.to(self.activity)
         nearest = _nearest(distance_m)
         c = self.config
@@ -190,9 +194,13 @@ def check_walls(distance_m: Tensor, bearing_rad: Tensor) -> None:
             f"walls: distances have shape {tuple(distance_m.shape)}, bearings "
             f"{tuple(bearing_rad.shape)}; expected the same"
         )
-    if not bool((distance_m >= 0).all()):
-        wrong = distance_m[~(distance_m >= 0)][0].item()
-        raise BadFrame(f"walls: distance {wrong:g} m; expected 0 or more, inf for none")
-    if not bool(bearing_rad.isfinite().all()):
-        wrong = bearing_rad[~bearing_rad.isfinite()][0].item()
-        raise BadFrame(f"walls: bearing {wrong:g} rad; expected a finite number")
+    right = (distance_m >= 0) & bearing_rad.isfinite()
+    if bool(right.all()):
+        return
+    negative = distance_m[~(distance_m >= 0)]
+    if len(negative):
+        raise BadFrame(
+            f"walls: distance {negative[0].item():g} m; expected 0 or more, inf for none"
+        )
+    wrong = bearing_rad[~bearing_rad.isfinite()][0].item()
+    raise BadFrame(f"walls: bearing {wrong:g} rad; expected a finite number")

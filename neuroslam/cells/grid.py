@@ -152,7 +152,7 @@ class LAHNGridCells(Running):
         for _ in range(steps):
             at = torch.rand(_DEVELOPMENT_BATCH, 2, generator=generator) - 0.5
             angle = torch.einsum("mjd,sd->smj", waves, _DEVELOPMENT_RANGE_M * at)
-            self.learn(torch.cat([angle.cos(), angle.sin()], dim=-1).to(self.bias))
+            self.learn(torch.stack([angle.cos(), angle.sin()], dim=-1).flatten(-2))
         self.generator_state = generator.get_state()
 
     @torch.no_grad()
@@ -169,12 +169,12 @@ class LAHNGridCells(Running):
         r"""Take in the oscillators' phases and return the rates :math:`[\xi - b]_+`.
 
         Args:
-            phases: Cosine and sine, ``([batch,] 2, n_modules, directions)``.
+            phases: Cosine and sine, ``([batch,] n_modules, directions, 2)``.
 
         Returns:
             ``([batch,] n_modules, n_cells)``, non-negative.
         """
-        inputs = torch.cat(phases.unbind(-3), dim=-1).to(self.bias.dtype)
+        inputs = phases.flatten(-2).to(self.bias.dtype)
         drive = lahn_drive(inputs, self.rates, self.feedforward, self.lateral)
         rates = (drive - self.bias).clamp_min(0.0)
         self.rates = rates.detach()

@@ -13,6 +13,10 @@ from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
 from neuroslam.population import Running
+from neuroslam.storage import Scalars
+
+FAMILIARITY_PERIOD_S = 0.3
+"""Time between looks at whether a place is what it was."""
 
 
 class Whereabouts(NamedTuple):
@@ -67,6 +71,7 @@ class NavigationCells(Running):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
+        self.now = Scalars(since_s=0.0, someone_lost=0)
 
     def forward(
         self,
@@ -94,30 +99,26 @@ class NavigationCells(Running):
         """
         check_motion(speed_m_s, heading_rad)
         check_walls(wall_m, wall_bearing_rad)
-        memory, oscillators = self.walls, self.oscillators
+        memory, oscillators, now = self.walls, self.oscillators, self.now
         lost = self.familiarity.lost
+        learns = ~lost if now.someone_lost else None
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
-        self.boundary(wall_m, bearing, dt_s)
+        self.boundary.respond(wall_m, bearing, dt_s)
         step = memory.move(speed_m_s, heading_rad, dt_s)
-        looks = memory.since.s >= self.config.wall_memory.period_s - 1e-9
         correction = torch.zeros_like(step)
-        if looks:
-            looked_s, compass_error = memory.since.s, memory.errors[:, 1]
-            if self.config.wall_memory.corrects:
-                correction = memory.look(
-                    oscillators.position_m + step, wall_m, bearing,
-                    compass=compass, learns=~lost,
-                )  # fmt: skip
-        grid = self.grid(oscillators.shift(step + correction))
-        place = self.place(grid.flatten(-2), oscillators.position_m, dt_s, learns=~lost)
-        if looks:
-            one = self.batch is None
-            felt = (wall_m[None], bearing[None]) if one else (wall_m, bearing)
+        if memory.is_due and self.config.wall_memory.corrects:
+            believed = oscillators.decode() + step
+            correction = memory.look(believed, wall_m, bearing, compass=compass, learns=learns)
+            step = step + correction
+        grid = self.grid(oscillators.shift(step))
+        place = self.place(grid.flatten(-2), oscillators.position_m, dt_s, learns=learns)
+        now.since_s += dt_s
+        if now.since_s >= FAMILIARITY_PERIOD_S:
+            felt = (wall_m, bearing) if self.batch is not None else (wall_m[None], bearing[None])
             lost = self.familiarity(
-                self.place.winner, felt[0], felt[1] - compass_error[:, None], looked_s
+                self.place.winner, felt[0], felt[1] - memory.errors[:, 1:], now.since_s
             )
-            if not self.config.wall_memory.corrects:
-                memory.start_anew()
+            now.since_s, now.someone_lost = 0.0, int(lost.any())
         return Whereabouts(
             oscillators.position_m,
             correction,

@@ -44,21 +44,23 @@ def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor
     Args:
         waves: :math:`\mathbf k`, ``(n_modules, directions, 2)``.
         displacement_m: :math:`\Delta x`, ``(..., 2)``.
-        phases: :math:`z` as cosine and sine, ``(..., 2, n_modules, directions)``.
+        phases: :math:`z` as cosine and sine, ``(..., n_modules, directions, 2)``.
 
     Example:
         >>> waves = wave_vectors(torch.tensor([0.5]), torch.tensor([0.0]), 6)
-        >>> start = torch.stack([torch.ones(1, 6), torch.zeros(1, 6)])
+        >>> start = torch.tensor([1.0, 0.0]).expand(1, 6, 2).contiguous()
         >>> lap = torch.tensor([0.5 * 3**0.5 / 2, 0.0])  # a whole wave along x
-        >>> turn_phases(waves, lap, start)[0, 0, 0].item()
-        1.0
+        >>> turn_phases(waves, lap, start)[0, 0].tolist()
+        [1.0, ...]
     """
-    angle = (waves @ displacement_m[..., None, :, None]).squeeze(-1)
-    c, s = angle.cos(), angle.sin()
-    x, y = phases.unbind(-3)
-    x, y = x * c - y * s, x * s + y * c
-    pull = 1.5 - 0.5 * (x * x + y * y)
-    return torch.stack([x * pull, y * pull], dim=-3)
+    z = torch.view_as_complex(phases) * torch.polar(*_unit_and_angle(waves, displacement_m))
+    return torch.view_as_real(z * (1.5 - 0.5 * (z * z.conj()).real))
+
+
+def _unit_and_angle(waves: Tensor, at_m: Tensor) -> tuple[Tensor, Tensor]:
+    angle = at_m @ waves.reshape(-1, 2).mT
+    angle = angle.unflatten(-1, waves.shape[:2])
+    return torch.ones_like(angle), angle
 
 
 def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor) -> Tensor:
@@ -71,17 +73,14 @@ def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor)
     Args:
         waves: :math:`K`, ``(n_modules, directions, 2)``.
         solver: Its pseudo-inverse, ``(2, n_modules * directions)``.
-        phases: :math:`z`, ``(..., 2, n_modules, directions)``.
+        phases: :math:`z`, ``(..., n_modules, directions, 2)``.
         near_m: :math:`x_0`, ``(..., 2)``.
 
     Returns:
         ``(..., 2)`` in metres.
     """
-    angle = (waves @ near_m[..., None, :, None]).squeeze(-1)
-    c, s = angle.cos(), angle.sin()
-    x, y = phases.unbind(-3)
-    off = torch.atan2(y * c - x * s, x * c + y * s).flatten(-2)
-    return near_m + off @ solver.mT
+    z = torch.view_as_complex(phases) * torch.polar(*_unit_and_angle(waves, -near_m))
+    return near_m + z.angle().flatten(-2) @ solver.mT
 
 
 class VelocityOscillators(Running):
@@ -96,9 +95,9 @@ class VelocityOscillators(Running):
     Example:
         >>> oscillators = VelocityOscillators(GridCellConfig())
         >>> oscillators(torch.tensor([0.2, 0.0]), dt_s=0.5).shape
-        torch.Size([2, 4, 6])
-        >>> oscillators.position_m.tolist()
-        [0.1..., 0.0...]
+        torch.Size([4, 6, 2])
+        >>> [round(x, 6) for x in oscillators.position_m.tolist()]
+        [0.1, 0.0]
     """
 
     phases: Tensor
@@ -114,8 +113,8 @@ class VelocityOscillators(Running):
         self.spacing_m = nn.Parameter(torch.tensor(config.spacings_m, dtype=kind))
         angles = torch.tensor(config.orientations_deg, dtype=kind).deg2rad()
         self.register_buffer("orientation_rad", angles, persistent=False)
-        start = torch.zeros(*lead, 2, len(angles), config.directions, dtype=kind)
-        start[..., 0, :, :] = 1.0
+        start = torch.zeros(*lead, len(angles), config.directions, 2, dtype=kind)
+        start[..., 0] = 1.0
         self.register_buffer("phases", start)
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
         self._waves: tuple[int, Tensor, Tensor] | None = None
@@ -145,21 +144,26 @@ class VelocityOscillators(Running):
         """Move by a displacement, ``([batch,] 2)``: all modules by the same, so they agree.
 
         Returns:
-            Phases as cosine and sine, ``([batch,] 2, n_modules, directions)``.
+            Phases as cosine and sine, ``([batch,] n_modules, directions, 2)``.
         """
-        waves, solver = self._kept_waves()
+        waves, _ = self._kept_waves()
         step = displacement_m.to(self.position_m)
         phases = turn_phases(waves, step, self.phases)
         self.phases = phases.detach()
-        position = decode_phases(waves, solver, phases, self.position_m + step)
-        self.position_m = position.detach()
+        self.position_m = self.position_m + step.detach()
         return phases
+
+    def decode(self) -> Tensor:
+        """Read the position, ``([batch,] 2)``, from the phases; it had been reckoned since."""
+        waves, solver = self._kept_waves()
+        self.position_m = decode_phases(waves, solver, self.phases, self.position_m).detach()
+        return self.position_m
 
     def place_at(self, position_m: Tensor) -> Tensor:
         """Set the phases to those of a position, ``([batch,] 2)``, and return them."""
         waves, _ = self._kept_waves()
         start = torch.zeros_like(self.phases)
-        start[..., 0, :, :] = 1.0
+        start[..., 0] = 1.0
         position_m = position_m.to(self.position_m)
         self.phases = turn_phases(waves, position_m, start).detach()
         self.position_m = position_m.detach().clone()

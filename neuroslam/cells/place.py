@@ -7,6 +7,7 @@ from torch import Tensor
 
 from neuroslam.config import PlaceCellConfig
 from neuroslam.population import Running
+from neuroslam.storage import Scalars
 
 NEIGHBOURS = 12
 """Links of a place cell to others that were active before or after it, at most."""
@@ -32,12 +33,7 @@ class PlaceResponse(NamedTuple):
 
 
 def place_response(
-    weights: Tensor,
-    centres_m: Tensor,
-    grid: Tensor,
-    position_m: Tensor,
-    power: float,
-    continuity_m: float,
+    weights: Tensor, away_m2: Tensor, grid: Tensor, power: float, continuity_m: float
 ) -> Tensor:
     r"""Return the responses of place cells before they compete.
 
@@ -49,9 +45,8 @@ def place_response(
 
     Args:
         weights: :math:`\mathbf w_j`, unit vectors, ``(..., n, n_grid)``.
-        centres_m: :math:`X_j`, ``(..., n, 2)``.
+        away_m2: :math:`|X_j - x|^2`, ``(..., n)``.
         grid: :math:`\hat{\mathbf g}`, the grid cells' rates as a unit vector, ``(..., n_grid)``.
-        position_m: :math:`x`, ``(..., 2)``.
         power: :math:`a`.
         continuity_m: :math:`\sigma`.
 
@@ -59,8 +54,7 @@ def place_response(
         ``(..., n)``, from 0 to 1.
     """
     alike = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0)
-    away = (centres_m - position_m.unsqueeze(-2)).square().sum(-1)
-    return alike.pow(power) * (away * (-0.5 / continuity_m**2)).exp().to(alike)
+    return alike.pow(power) * (away_m2 * (-0.5 / continuity_m**2)).exp()
 
 
 def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
@@ -69,8 +63,9 @@ def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
     .. math:: \mathbf w \leftarrow \frac{\mathbf w + \eta(\hat{\mathbf g} - \mathbf w)}{|\cdot|}
 
     Example:
-        >>> hebbian_step(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0]), 0.5).tolist()
-        [0.707..., 0.707...]
+        >>> moved = hebbian_step(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0]), 0.5)
+        >>> [round(w, 3) for w in moved.tolist()]
+        [0.707, 0.707]
     """
     moved = weights + rate * (grid - weights)
     return moved / moved.norm(dim=-1, keepdim=True)
@@ -122,7 +117,9 @@ class CompetitiveHebbianPlaceCells(Running):
         self.register_buffer("winner", torch.full((b,), _NO_CELL, dtype=torch.int64))
         self.register_buffer("window", torch.arange(_WINDOW).repeat(b, 1))
         self.register_buffer("window_at_m", torch.full((b, 2), _FAR_M, dtype=torch.float64))
+        self.now = Scalars(stay_s=0.0)
         self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
+        self.register_state_dict_pre_hook(lambda module, *_: module._write_back())
         self.register_load_state_dict_pre_hook(_take_capacity)
         self.register_load_state_dict_post_hook(lambda module, _: module._forget_window())
 
@@ -152,26 +149,24 @@ class CompetitiveHebbianPlaceCells(Running):
         position = (position_m[None] if one else position_m).detach().to(self.centres_m)
         weights, centres = self._nearest(position)
         c = self.config
-        response = place_response(weights, centres, grid, position, c.power, c.continuity_m)
-        best = response.argmax(-1, keepdim=True)
-        winner = self.window.gather(1, best)[:, 0]
         away = (centres - position.unsqueeze(1)).square().sum(-1)
+        response = place_response(weights, away.to(grid), grid, c.power, c.continuity_m)
+        slot = response.argmax(-1)
         recruited = away.amin(-1) >= c.threshold_m**2
-        if learns is None:
-            learns = torch.ones_like(recruited)
-        recruited = recruited & learns
+        if learns is not None:
+            recruited = recruited & learns
         if bool(recruited.any()):
-            winner = self._recruit(recruited, grid, position, winner)
+            slot = self._recruit(recruited, grid, position, slot, away)
+        winner = self.window.gather(1, slot[:, None])[:, 0]
         winner = winner.where(self.n_cells > 0, _NO_CELL)
         if c.hebbian_rate:
-            self._learn(grid, winner, best, learns & ~recruited)
+            self._learn(grid, slot, learns)
         changed = winner != self.winner
-        enters = changed & learns
-        if bool(enters.any()):
-            self._enter(enters, winner)
-        stays = (learns * dt_s).to(self.time_s)
-        self.time_s.scatter_add_(1, winner.clamp_min(0)[:, None], stays[:, None])
-        self.winner = winner
+        if bool(changed.any()):
+            self._flush_time()
+            self._enter(changed if learns is None else changed & learns, winner)
+            self.winner = winner
+        self.now.stay_s += dt_s
         result = PlaceResponse(winner, recruited, changed)
         return PlaceResponse(*(part[0] for part in result)) if one else result
 
@@ -182,18 +177,17 @@ class CompetitiveHebbianPlaceCells(Running):
             grid: Rates of the grid cells, ``([batch,] n_grid)``.
             position_m: Where the animal is; ``None``: the response to the grid alone.
         """
+        self._write_back()
         one = self.batch is None
         grid = (grid[None] if one else grid).to(self.weights)
         grid = grid / grid.norm(dim=-1, keepdim=True).clamp_min(1e-12)
         c, n = self.config, int(self.n_cells.max())
         weights = self.weights[:, :n]
-        if position_m is None:
-            response = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0).pow(c.power)
-        else:
+        away = torch.zeros_like(weights[..., 0])
+        if position_m is not None:
             position = (position_m[None] if one else position_m).to(self.centres_m)
-            response = place_response(
-                weights, self.centres_m[:, :n], grid, position, c.power, c.continuity_m
-            )
+            away = (self.centres_m[:, :n] - position.unsqueeze(1)).square().sum(-1).to(away)
+        response = place_response(weights, away, grid, c.power, c.continuity_m)
         return response[0] if one else response
 
     def centre_of(self, cells: Tensor) -> Tensor:
@@ -213,22 +207,28 @@ class CompetitiveHebbianPlaceCells(Running):
 
     def _nearest(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return weights and centres of the nearest cells of each animal."""
-        moved = (position - self.window_at_m).square().sum(-1)
-        if bool((moved > _SLACK_M**2).any()):
+        moved = (position - self.window_at_m).square().sum(-1) > _SLACK_M**2
+        if bool(moved.any()):
+            self._write_back()
+            rows = moved.nonzero()[:, 0]
             n = max(_WINDOW, int(self.n_cells.max()))
-            away = (self.centres_m[:, :n] - position.unsqueeze(1)).square().sum(-1)
-            self.window = away.topk(_WINDOW, dim=1, largest=False).indices
-            self.window_at_m = position
-            self._near = None
-        if self._near is None:
-            at = self.window.unsqueeze(-1)
-            self._near = (
-                self.weights.gather(1, at.expand(-1, -1, self.weights.shape[2])),
-                self.centres_m.gather(1, at.expand(-1, -1, 2)),
+            away = (self.centres_m[rows, :n] - position[rows].unsqueeze(1)).square().sum(-1)
+            self.window = self.window.index_put(
+                (rows,), away.topk(_WINDOW, dim=1, largest=False, sorted=False).indices
             )
+            self.window_at_m = position.where(moved.unsqueeze(1), self.window_at_m)
+            if self._near is not None:
+                for near, table in zip(self._near, (self.weights, self.centres_m), strict=True):
+                    near[rows] = table[rows.unsqueeze(1), self.window[rows]]
+        if self._near is None:
+            rows = torch.arange(len(position), device=position.device).unsqueeze(1)
+            self._near = self.weights[rows, self.window], self.centres_m[rows, self.window]
         return self._near
 
-    def _recruit(self, recruited: Tensor, grid: Tensor, position: Tensor, winner: Tensor) -> Tensor:
+    def _recruit(
+        self, recruited: Tensor, grid: Tensor, position: Tensor, slot: Tensor, away: Tensor
+    ) -> Tensor:
+        """Add a cell for each animal that needs one; returns the slots of the winners."""
         rows = recruited.nonzero()[:, 0]
         new = self.n_cells[rows]
         if int(new.max()) >= self.capacity:
@@ -237,27 +237,35 @@ class CompetitiveHebbianPlaceCells(Running):
         self.centres_m[rows, new] = position[rows]
         self.n_cells = self.n_cells + recruited.long()
         # The newcomer takes the place of the farthest in the window, or it is in there already.
-        at = self.window[rows]
-        is_in = at == new.unsqueeze(1)
-        centres = self._near[1][rows]
-        away = (centres - position[rows].unsqueeze(1)).square().sum(-1)
-        slot = torch.where(is_in.any(1), is_in.long().argmax(1), away.argmax(1))
-        window = self.window.clone()
-        window[rows, slot] = new
-        self.window = window
-        self._near[0][rows, slot] = grid[rows]
-        self._near[1][rows, slot] = position[rows]
-        return winner.where(~recruited, self.n_cells - 1)
+        is_in = self.window[rows] == new.unsqueeze(1)
+        at = torch.where(is_in.any(1), is_in.long().argmax(1), away[rows].argmax(1))
+        self._write_back()  # before another cell takes the slot
+        self.window = self.window.index_put((rows, at), new)
+        self._near[0][rows, at] = grid[rows]
+        self._near[1][rows, at] = position[rows]
+        return slot.index_put((rows,), at)
 
-    def _learn(self, grid: Tensor, winner: Tensor, slot: Tensor, which: Tensor) -> None:
+    def _learn(self, grid: Tensor, slot: Tensor, learns: Tensor | None) -> None:
+        """Let the winners learn, in the window; the table has it when the window moves on."""
         near = self._near[0]
-        at = slot.unsqueeze(-1).expand(-1, 1, near.shape[-1])
+        at = slot[:, None, None].expand(-1, 1, near.shape[-1])
         before = near.gather(1, at)
         after = hebbian_step(before, grid.unsqueeze(1), self.config.hebbian_rate)
-        after = after.where(which[:, None, None], before)
+        if learns is not None:
+            after = after.where(learns[:, None, None], before)
         near.scatter_(1, at, after)
-        rows = which.nonzero()[:, 0]
-        self.weights[rows, winner[rows]] = after[rows, 0]
+
+    def _write_back(self) -> None:
+        """Bring what was learnt in the window into the table."""
+        if self._near is not None:
+            rows = torch.arange(len(self.window), device=self.window.device).unsqueeze(1)
+            self.weights[rows, self.window] = self._near[0]
+
+    def _flush_time(self) -> None:
+        """Credit the time since the winners last changed to them."""
+        had = (self.winner >= 0).to(self.time_s) * self.now.stay_s
+        self.time_s.scatter_add_(1, self.winner.clamp_min(0)[:, None], had[:, None])
+        self.now.stay_s = 0.0
 
     def _enter(self, changed: Tensor, winner: Tensor) -> None:
         rows = changed.nonzero()[:, 0]

@@ -128,6 +128,11 @@ class WallMemory(Running):
         """Covariance of the position, ``(batch or 1, 2, 2)``, as of the last look."""
         return self.covariance[:, :2, :2]
 
+    @property
+    def is_due(self) -> bool:
+        """Whether enough time went by since the last look for a new one to tell something."""
+        return self.since.s >= self.config.period_s - 1e-9
+
     def remembered(self) -> list[Wall]:
         """Return all walls of each animal, as columns."""
         return [
@@ -178,9 +183,11 @@ class WallMemory(Running):
         """
         one = self.batch is None
         position = (position_m[None] if one else position_m).to(self.errors)
-        if self.since.s < self.config.period_s - 1e-9:
+        if not self.is_due:
             return torch.zeros_like(position[0] if one else position)
         distance = (distance_m[None] if one else distance_m).to(self.errors)
+        if not bool(distance.isfinite().any()):
+            return torch.zeros_like(position[0] if one else position)  # and wait for the next
         bearing = (bearing_rad[None] if one else bearing_rad).to(self.errors)
         self._predict(compass)
         start = position

@@ -243,7 +243,7 @@ class Arena:
             for hole in self.holes:
                 inside[rows] &= ~_within(points[rows], hole)
         unsure = np.flatnonzero(~inside)
-        inside[unsure] = self.clearance(points[unsure]) <= _TOUCH_M
+        inside[unsure] = self._clearance(points[unsure], self._n_sides) <= _TOUCH_M
         return inside
 
     def check_inside(self, positions: ArrayLike) -> None:
@@ -262,11 +262,13 @@ class Arena:
 
     def clearance(self, positions: ArrayLike) -> np.ndarray:
         """Measure from positions ``(n, 2)`` to the nearest point of any wall, in m, ``(n,)``."""
-        points = self._points(positions)
+        return self._clearance(self._points(positions), len(self._half))
+
+    def _clearance(self, points: np.ndarray, n_straight: int) -> np.ndarray:
         nearest = np.empty(len(points))
         for rows in self._chunks(len(points)):
-            s, t = self._frames(points[rows])
-            past = np.maximum(np.abs(t) - 1.0, 0.0) * self._half
+            s, t = (value[:, :n_straight] for value in self._frames(points[rows]))
+            past = np.maximum(np.abs(t) - 1.0, 0.0) * self._half[:n_straight]
             gaps = [np.hypot(s, past), np.abs(self._beyond_circles(points[rows]))]
             nearest[rows] = np.concatenate(gaps, axis=1).min(axis=1)
         return nearest
@@ -383,7 +385,7 @@ class Arena:
         # Walls first, rays last: the reduction over walls is then one of whole rows.
         s, t, side = (np.repeat(a.T, repeat, axis=1) for a in (s, t, side))
         closing = -(self._off[0].T @ ray.T) * side
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             along = s / closing
             t += along * (self._on[0].T @ ray.T)
             hit = (closing > 0.0) & (np.abs(t) <= 1.0 + _TOUCH_M)

@@ -254,7 +254,8 @@ def _fit(table: list[list[float]], count: int, tolerance_m: float) -> tuple[_Cur
         return curve, False
     bent, q2_std = _third(det, (s, su, suu), (suu, suuu, s4), (sv, suv, suuv), svv, count)
     kinked, kink_std = _third(det, (s, su, suu), (sa, sua, saa), (sv, suv, sav), svv, count)
-    sharp = kinked.q[2] > _SHARP * kink_std * kinked.rms and kinked.rms < bent.rms
+    noise_m = max(kinked.rms, 0.1 * tolerance_m)  # less than that is not worth a corner
+    sharp = kinked.q[2] > _SHARP * kink_std * noise_m and kinked.rms < bent.rms
     # Bent only if the noise does not explain it: else a wall would bend round the next corner.
     return bent if abs(bent.q[2]) > _BENT * q2_std * tolerance_m else curve, sharp
 
