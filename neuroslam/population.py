@@ -107,6 +107,17 @@ class Population(nn.Module, ABC):
             A state with the same names.
         """
 
+    def __setattr__(self, name: str, value: object) -> None:
+        """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
+
+        Anything else is left to torch.
+        """
+        buffers = self.__dict__.get("_buffers")
+        if buffers is not None and type(value) is Tensor and name in buffers:
+            buffers[name] = value
+        else:
+            super().__setattr__(name, value)
+
 
 class Running(Population):
     """A population whose state is only about now: the session that goes on keeps its own."""

@@ -152,11 +152,10 @@ class BoundaryCells(Running):
 
     def respond(self, distance_m: Tensor, bearing_rad: Tensor, dt_s: float) -> Tensor:
         """Do as :meth:`forward` with walls that were checked."""
-        distance_m, bearing_rad = distance_m.to(self.activity), bearing_rad.to(self.activity)
-        nearest = _nearest(distance_m)
         c = self.config
+        distance_m, bearing_rad = distance_m.to(self.activity), bearing_rad.to(self.activity)
         self.activity = boundary_activity(
-            self.activity, nearest, c.reach_m, c.rate_per_s, dt_s
+            self.activity, _nearest(distance_m), c.reach_m, c.rate_per_s, dt_s
         ).detach()
         tuned = boundary_tuning(
             distance_m,
@@ -170,6 +169,11 @@ class BoundaryCells(Running):
         rates = self.activity[..., None, None] * tuned
         self.rates = rates.detach()
         return rates
+
+    def rest(self) -> None:
+        """Do as with no wall in reach: nothing is active."""
+        self.activity = torch.zeros_like(self.activity)
+        self.rates = torch.zeros_like(self.rates)
 
 
 def _nearest(distance_m: Tensor) -> Tensor:

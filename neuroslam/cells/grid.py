@@ -17,9 +17,9 @@ class LAHNWeights(NamedTuple):
     r"""What a lateral anti-Hebbian network learns.
 
     Attributes:
-        feedforward: :math:`Q`, ``(..., n_modules, n_cells, n_inputs)``, rows of unit norm.
-        lateral: :math:`W \le 0`, ``(..., n_modules, n_cells, n_cells)``, zero diagonal.
-        threshold: Above it a cell learns, ``(..., n_modules, n_cells)``.
+        feedforward: :math:`Q`, ``(n_modules, n_cells, n_inputs)``, rows of unit norm.
+        lateral: :math:`W \le 0`, ``(n_modules, n_cells, n_cells)``, zero diagonal.
+        threshold: Above it a cell learns, ``(n_modules, n_cells)``.
         bias: Above it a cell fires, the same shape.
     """
 
@@ -39,11 +39,13 @@ def lahn_drive(inputs: Tensor, rates: Tensor, feedforward: Tensor, lateral: Tens
     Args:
         inputs: :math:`x`, ``(..., n_modules, n_inputs)``.
         rates: :math:`r(t-1)`, ``(..., n_modules, n_cells)``.
-        feedforward: :math:`Q`.
-        lateral: :math:`W`.
+        feedforward: :math:`Q`, ``(n_modules, n_cells, n_inputs)``.
+        lateral: :math:`W`, ``(n_modules, n_cells, n_cells)``.
     """
-    forward = (feedforward @ inputs.unsqueeze(-1)).squeeze(-1)
-    return forward + (lateral @ rates.unsqueeze(-1)).squeeze(-1)
+    # Modules in front: one matrix product each for all animals, and no weights copied for them.
+    x, r = (v.reshape(-1, *v.shape[-2:]).transpose(0, 1) for v in (inputs, rates))
+    drive = torch.baddbmm(torch.bmm(x, feedforward.mT), r, lateral.mT)
+    return drive.transpose(0, 1).reshape(rates.shape)
 
 
 def lahn_learn(

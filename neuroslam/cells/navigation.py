@@ -1,5 +1,6 @@
 """SLRB: boundary cells, grid cells and place cells composed; motion and walls in, a place out."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.population import Running
 from neuroslam.storage import Scalars
 
-FAMILIARITY_PERIOD_S = 0.3
+FAMILIARITY_PERIOD_S = 0.5
 """Time between looks at whether a place is what it was."""
 
 
@@ -97,16 +98,22 @@ class NavigationCells(Running):
         Raises:
             BadFrame: If a number is not finite or a distance negative; nothing has changed then.
         """
-        check_motion(speed_m_s, heading_rad)
-        check_walls(wall_m, wall_bearing_rad)
+        bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
+        total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
+        nearest = float(wall_m.min()) if wall_m.numel() else math.inf
+        if not math.isfinite(total) or not nearest >= 0.0:
+            check_motion(speed_m_s, heading_rad)
+            check_walls(wall_m, wall_bearing_rad)
         memory, oscillators, now = self.walls, self.oscillators, self.now
         lost = self.familiarity.lost
         learns = ~lost if now.someone_lost else None
-        bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
-        self.boundary.respond(wall_m, bearing, dt_s)
+        if nearest <= self.config.boundary_cells.reach_m:
+            self.boundary.respond(wall_m, bearing, dt_s)
+        else:
+            self.boundary.rest()
         step = memory.move(speed_m_s, heading_rad, dt_s)
         correction = torch.zeros_like(step)
-        if memory.is_due and self.config.wall_memory.corrects:
+        if nearest < math.inf and memory.is_due and self.config.wall_memory.corrects:
             believed = oscillators.decode() + step
             correction = memory.look(believed, wall_m, bearing, compass=compass, learns=learns)
             step = step + correction

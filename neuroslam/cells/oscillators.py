@@ -30,16 +30,15 @@ def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) ->
 
 
 def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor:
-    r"""Turn the oscillators by a displacement and draw them to the unit circle.
+    r"""Turn the oscillators by a displacement.
 
-    .. math:: z_j \leftarrow z_j\,e^{i\,\mathbf k_j \cdot \Delta x}, \qquad
-              |z| \leftarrow \tfrac12 (3 - |z|^2)\,|z|
+    .. math:: z_j \leftarrow z_j\,e^{i\,\mathbf k_j \cdot \Delta x}
 
-    This is the Hopf oscillator :math:`\dot z = i\omega z + z(1 - |z|^2)`, SLRB Eqs. 10 and 11,
-    with :math:`\omega_j = \mathbf k_j \cdot \mathbf v` integrated exactly. (Euler steps of it leave
-    the unit circle, by half at 15 rad/s. The boundary response that Eqs. 10 and 11 add to every
-    frequency turns all phases alike and means nothing; walls correct the phases instead.) The
-    second step is one of Newton's for :math:`|z| = 1`: it takes back what rounding adds.
+    This is the Hopf oscillator :math:`\dot z = i\omega z + z(1 - |z|^2)` on its unit circle, SLRB
+    Eqs. 10 and 11, with :math:`\omega_j = \mathbf k_j \cdot \mathbf v` integrated exactly. (Euler
+    steps of it leave the unit circle, by half at 15 rad/s. The boundary response that Eqs. 10 and
+    11 add to every frequency turns all phases alike and means nothing; walls correct the phases
+    instead.)
 
     Args:
         waves: :math:`\mathbf k`, ``(n_modules, directions, 2)``.
@@ -50,17 +49,25 @@ def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor
         >>> waves = wave_vectors(torch.tensor([0.5]), torch.tensor([0.0]), 6)
         >>> start = torch.tensor([1.0, 0.0]).expand(1, 6, 2).contiguous()
         >>> lap = torch.tensor([0.5 * 3**0.5 / 2, 0.0])  # a whole wave along x
-        >>> turn_phases(waves, lap, start)[0, 0].tolist()
-        [1.0, ...]
+        >>> turn_phases(waves, lap, start)[0, 0].round(decimals=5).abs().tolist()
+        [1.0, 0.0]
     """
-    z = torch.view_as_complex(phases) * torch.polar(*_unit_and_angle(waves, displacement_m))
-    return torch.view_as_real(z * (1.5 - 0.5 * (z * z.conj()).real))
+    return torch.view_as_real(torch.view_as_complex(phases) * _turn(waves, displacement_m))
 
 
-def _unit_and_angle(waves: Tensor, at_m: Tensor) -> tuple[Tensor, Tensor]:
-    angle = at_m @ waves.reshape(-1, 2).mT
-    angle = angle.unflatten(-1, waves.shape[:2])
-    return torch.ones_like(angle), angle
+def restore_amplitude(phases: Tensor) -> Tensor:
+    r"""Draw oscillators to the unit circle, as :math:`z(1 - |z|^2)` does: takes back rounding.
+
+    .. math:: z \leftarrow \tfrac12 (3 - |z|^2)\,z
+
+    One step of Newton's for :math:`|z| = 1`.
+    """
+    return phases * (1.5 - 0.5 * phases.square().sum(-1, keepdim=True))
+
+
+def _turn(waves: Tensor, at_m: Tensor) -> Tensor:
+    angle = (at_m @ waves.reshape(-1, 2).mT).unflatten(-1, waves.shape[:2])
+    return torch.polar(angle.new_ones(()).expand_as(angle), angle)
 
 
 def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor) -> Tensor:
@@ -79,7 +86,7 @@ def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor)
     Returns:
         ``(..., 2)`` in metres.
     """
-    z = torch.view_as_complex(phases) * torch.polar(*_unit_and_angle(waves, -near_m))
+    z = torch.view_as_complex(phases) * _turn(waves, -near_m)
     return near_m + z.angle().flatten(-2) @ solver.mT
 
 
@@ -156,6 +163,7 @@ class VelocityOscillators(Running):
     def decode(self) -> Tensor:
         """Read the position, ``([batch,] 2)``, from the phases; it had been reckoned since."""
         waves, solver = self._kept_waves()
+        self.phases = restore_amplitude(self.phases).detach()
         self.position_m = decode_phases(waves, solver, self.phases, self.position_m).detach()
         return self.position_m
 

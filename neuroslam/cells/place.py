@@ -12,8 +12,10 @@ from neuroslam.storage import Scalars
 NEIGHBOURS = 12
 """Links of a place cell to others that were active before or after it, at most."""
 
-_WINDOW = 64  # nearest cells, among which the winner is
+_WINDOW = 32  # nearest cells, among which the winner is
 _SLACK_M = 0.06  # the animal may move so far before the window is looked up anew
+_STILL = 1 / 6  # of the distance between cells; who moved less has the same winner
+_ROOM = 64  # cells that a table begins with
 _NO_CELL = -1
 _FAR_M = 1e6
 
@@ -67,8 +69,7 @@ def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
         >>> [round(w, 3) for w in moved.tolist()]
         [0.707, 0.707]
     """
-    moved = weights + rate * (grid - weights)
-    return moved / moved.norm(dim=-1, keepdim=True)
+    return torch.nn.functional.normalize(torch.lerp(weights, grid, rate), dim=-1)
 
 
 class CompetitiveHebbianPlaceCells(Running):
@@ -100,7 +101,8 @@ class CompetitiveHebbianPlaceCells(Running):
     neighbours: Tensor
     winner: Tensor
     window: Tensor
-    window_at_m: Tensor
+    landmarks_m: Tensor
+    leash_m2: Tensor
 
     def __init__(self, config: PlaceCellConfig, n_grid: int, batch: int | None = None) -> None:
         super().__init__()
@@ -108,15 +110,18 @@ class CompetitiveHebbianPlaceCells(Running):
         self.batch = batch
         b = batch or 1
         self.register_buffer("n_cells", torch.zeros(b, dtype=torch.int64))
-        self.register_buffer("weights", torch.zeros(b, _WINDOW, n_grid))
-        self.register_buffer("centres_m", torch.full((b, _WINDOW, 2), _FAR_M, dtype=torch.float64))
-        self.register_buffer("visits", torch.zeros(b, _WINDOW, dtype=torch.int64))
-        self.register_buffer("time_s", torch.zeros(b, _WINDOW, dtype=torch.float64))
-        none = torch.full((b, _WINDOW, NEIGHBOURS), _NO_CELL, dtype=torch.int64)
+        self.register_buffer("weights", torch.zeros(b, _ROOM, n_grid))
+        self.register_buffer("centres_m", torch.full((b, _ROOM, 2), _FAR_M, dtype=torch.float64))
+        self.register_buffer("visits", torch.zeros(b, _ROOM, dtype=torch.int64))
+        self.register_buffer("time_s", torch.zeros(b, _ROOM, dtype=torch.float64))
+        none = torch.full((b, _ROOM, NEIGHBOURS), _NO_CELL, dtype=torch.int64)
         self.register_buffer("neighbours", none)
         self.register_buffer("winner", torch.full((b,), _NO_CELL, dtype=torch.int64))
         self.register_buffer("window", torch.arange(_WINDOW).repeat(b, 1))
-        self.register_buffer("window_at_m", torch.full((b, 2), _FAR_M, dtype=torch.float64))
+        # Where the cells competed last, and where the window was looked up.
+        self.register_buffer("landmarks_m", torch.full((2, b, 2), _FAR_M, dtype=torch.float64))
+        leash = torch.tensor([[_STILL * config.threshold_m], [_SLACK_M]], dtype=torch.float64)
+        self.register_buffer("leash_m2", leash.square(), persistent=False)
         self.now = Scalars(stay_s=0.0)
         self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
         self.register_state_dict_pre_hook(lambda module, *_: module._write_back())
@@ -136,6 +141,9 @@ class CompetitiveHebbianPlaceCells(Running):
     ) -> PlaceResponse:
         """Let the cells compete; recruit one where none is near, and let the winner learn.
 
+        Nothing is done while all animals are within a sixth of ``threshold_m`` of where the cells
+        competed last: who stands still has the same winner, and it is not taught the same again.
+
         Args:
             grid: Rates of the grid cells, ``([batch,] n_grid)``.
             position_m: Position that the phases of the grid tell, ``([batch,] 2)``.
@@ -144,10 +152,16 @@ class CompetitiveHebbianPlaceCells(Running):
                 all.
         """
         one = self.batch is None
-        grid = (grid[None] if one else grid).detach().to(self.weights)
-        grid = grid / grid.norm(dim=-1, keepdim=True).clamp_min(1e-12)
         position = (position_m[None] if one else position_m).detach().to(self.centres_m)
-        weights, centres = self._nearest(position)
+        moved = (position - self.landmarks_m).square().sum(-1) > self.leash_m2
+        competes, leaves_window = moved.any(1).tolist()
+        if not competes:
+            self.now.stay_s += dt_s
+            nobody = torch.zeros_like(self.winner, dtype=torch.bool)
+            return self._response(nobody, nobody)
+        grid = (grid[None] if one else grid).detach().to(self.weights)
+        grid = torch.nn.functional.normalize(grid, dim=-1)
+        weights, centres = self._nearest(position, moved[1] if leaves_window else None)
         c = self.config
         away = (centres - position.unsqueeze(1)).square().sum(-1)
         response = place_response(weights, away.to(grid), grid, c.power, c.continuity_m)
@@ -158,7 +172,8 @@ class CompetitiveHebbianPlaceCells(Running):
         if bool(recruited.any()):
             slot = self._recruit(recruited, grid, position, slot, away)
         winner = self.window.gather(1, slot[:, None])[:, 0]
-        winner = winner.where(self.n_cells > 0, _NO_CELL)
+        if learns is not None:  # who is lost from the start has no cell
+            winner = winner.where(self.n_cells > 0, _NO_CELL)
         if c.hebbian_rate:
             self._learn(grid, slot, learns)
         changed = winner != self.winner
@@ -167,8 +182,12 @@ class CompetitiveHebbianPlaceCells(Running):
             self._enter(changed if learns is None else changed & learns, winner)
             self.winner = winner
         self.now.stay_s += dt_s
-        result = PlaceResponse(winner, recruited, changed)
-        return PlaceResponse(*(part[0] for part in result)) if one else result
+        return self._response(recruited, changed)
+
+    def _response(self, recruited: Tensor, changed: Tensor) -> PlaceResponse:
+        if self.batch is not None:
+            return PlaceResponse(self.winner, recruited, changed)
+        return PlaceResponse(self.winner[0], recruited[0], changed[0])
 
     def responses(self, grid: Tensor, position_m: Tensor | None = None) -> Tensor:
         """Return the responses of all cells, ``([batch,] n)``, zero where there is none.
@@ -180,7 +199,7 @@ class CompetitiveHebbianPlaceCells(Running):
         self._write_back()
         one = self.batch is None
         grid = (grid[None] if one else grid).to(self.weights)
-        grid = grid / grid.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        grid = torch.nn.functional.normalize(grid, dim=-1)
         c, n = self.config, int(self.n_cells.max())
         weights = self.weights[:, :n]
         away = torch.zeros_like(weights[..., 0])
@@ -205,21 +224,22 @@ class CompetitiveHebbianPlaceCells(Running):
         links = torch.unique(links.sort(dim=1).values, dim=0)
         return self.centres_m[animal, :n].clone(), links
 
-    def _nearest(self, position: Tensor) -> tuple[Tensor, Tensor]:
+    def _nearest(self, position: Tensor, moved: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return weights and centres of the nearest cells of each animal."""
-        moved = (position - self.window_at_m).square().sum(-1) > _SLACK_M**2
-        if bool(moved.any()):
-            self._write_back()
+        looked_up_at = self.landmarks_m[1]
+        if moved is not None:
             rows = moved.nonzero()[:, 0]
+            self._write_back(rows)
             n = max(_WINDOW, int(self.n_cells.max()))
             away = (self.centres_m[rows, :n] - position[rows].unsqueeze(1)).square().sum(-1)
             self.window = self.window.index_put(
                 (rows,), away.topk(_WINDOW, dim=1, largest=False, sorted=False).indices
             )
-            self.window_at_m = position.where(moved.unsqueeze(1), self.window_at_m)
+            looked_up_at = position.where(moved.unsqueeze(1), looked_up_at)
             if self._near is not None:
                 for near, table in zip(self._near, (self.weights, self.centres_m), strict=True):
                     near[rows] = table[rows.unsqueeze(1), self.window[rows]]
+        self.landmarks_m = torch.stack([position, looked_up_at])
         if self._near is None:
             rows = torch.arange(len(position), device=position.device).unsqueeze(1)
             self._near = self.weights[rows, self.window], self.centres_m[rows, self.window]
@@ -239,7 +259,7 @@ class CompetitiveHebbianPlaceCells(Running):
         # The newcomer takes the place of the farthest in the window, or it is in there already.
         is_in = self.window[rows] == new.unsqueeze(1)
         at = torch.where(is_in.any(1), is_in.long().argmax(1), away[rows].argmax(1))
-        self._write_back()  # before another cell takes the slot
+        self._write_back(rows)  # before another cell takes the slot
         self.window = self.window.index_put((rows, at), new)
         self._near[0][rows, at] = grid[rows]
         self._near[1][rows, at] = position[rows]
@@ -255,11 +275,13 @@ class CompetitiveHebbianPlaceCells(Running):
             after = after.where(learns[:, None, None], before)
         near.scatter_(1, at, after)
 
-    def _write_back(self) -> None:
-        """Bring what was learnt in the window into the table."""
-        if self._near is not None:
-            rows = torch.arange(len(self.window), device=self.window.device).unsqueeze(1)
-            self.weights[rows, self.window] = self._near[0]
+    def _write_back(self, rows: Tensor | None = None) -> None:
+        """Bring what was learnt in the windows, of some animals or all, into the table."""
+        if self._near is None:
+            return
+        if rows is None:
+            rows = torch.arange(len(self.window), device=self.window.device)
+        self.weights[rows.unsqueeze(1), self.window[rows]] = self._near[0][rows]
 
     def _flush_time(self) -> None:
         """Credit the time since the winners last changed to them."""

@@ -102,8 +102,7 @@ class WallMemory(Running):
     covariance: Tensor
     errors: Tensor
     moved_m: Tensor
-    spread_m2: Tensor
-    innovation: Tensor
+    squares_m2: Tensor
 
     def __init__(self, config: WallMemoryConfig, batch: int | None = None) -> None:
         super().__init__()
@@ -116,8 +115,7 @@ class WallMemory(Running):
         self.register_buffer("covariance", torch.zeros(b, OWN, OWN, **kind))
         self.register_buffer("errors", torch.zeros(b, 2, **kind))
         self.register_buffer("moved_m", torch.zeros(b, 2, **kind))
-        self.register_buffer("spread_m2", torch.zeros(b, 2, 2, **kind))
-        self.register_buffer("innovation", torch.zeros(b, **kind))
+        self.register_buffer("squares_m2", torch.zeros(b, **kind))
         self.since = Scalars(s=0.0, squares_s2=0.0)
         variances = [0.0, 0.0, config.speed_scale**2, math.radians(config.heading_slow_deg) ** 2]
         self.covariance[:] = torch.diag(torch.tensor(variances, **kind))
@@ -126,7 +124,7 @@ class WallMemory(Running):
     @property
     def position_variance_m2(self) -> Tensor:
         """Covariance of the position, ``(batch or 1, 2, 2)``, as of the last look."""
-        return self.covariance[:, :2, :2]
+        return self.covariance[:, :2, :2].clone()
 
     @property
     def is_due(self) -> bool:
@@ -150,11 +148,10 @@ class WallMemory(Running):
         """
         speed_m_s, heading_rad = speed_m_s.to(self.errors), heading_rad.to(self.errors)
         scale, compass = self.errors.unbind(-1)
-        heading = heading_rad - compass
-        length = speed_m_s * dt_s * (1.0 - scale)
-        step = length.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], dim=-1)
+        length = speed_m_s * (dt_s - dt_s * scale)
+        step = torch.view_as_real(torch.polar(length, heading_rad - compass))
         self.moved_m = self.moved_m + step
-        self.spread_m2 = self.spread_m2 + step.unsqueeze(-1) * step.unsqueeze(-2)
+        self.squares_m2 = self.squares_m2 + length * length
         self.since.s += dt_s
         self.since.squares_s2 += dt_s * dt_s
         return step if self.batch is not None else step[0]
@@ -183,15 +180,12 @@ class WallMemory(Running):
         """
         one = self.batch is None
         position = (position_m[None] if one else position_m).to(self.errors)
-        if not self.is_due:
+        if not self.is_due or not bool(distance_m.isfinite().any()):
             return torch.zeros_like(position[0] if one else position)
         distance = (distance_m[None] if one else distance_m).to(self.errors)
-        if not bool(distance.isfinite().any()):
-            return torch.zeros_like(position[0] if one else position)  # and wait for the next
         bearing = (bearing_rad[None] if one else bearing_rad).to(self.errors)
         self._predict(compass)
         start = position
-        self.innovation = torch.zeros_like(self.innovation)
         for wall in range(distance.shape[-1]):
             seen = distance[:, wall].isfinite()
             if not bool(seen.any()):
@@ -236,7 +230,7 @@ class WallMemory(Running):
     def start_anew(self) -> None:
         """Forget the motion since the last look."""
         self.moved_m = torch.zeros_like(self.moved_m)
-        self.spread_m2 = torch.zeros_like(self.spread_m2)
+        self.squares_m2 = torch.zeros_like(self.squares_m2)
         self.since.s = self.since.squares_s2 = 0.0
 
     def _predict(self, compass: bool) -> None:
@@ -246,31 +240,28 @@ class WallMemory(Running):
                   F = I + \Big[-\tfrac{d}{1 - s},\; d^\perp\Big]
                   \text{ from speed and compass error to position}
 
-        with :math:`d` the way moved; :math:`Q` is along and across each step. The compass error
-        decays in its time, or, if the heading is integrated, does not.
+        with :math:`d` the way moved; :math:`Q` is what each sample's own errors add, taken alike
+        along and across. The compass error decays in its time, or, if the heading is integrated,
+        does not.
         """
-        c, p = self.config, self.covariance
+        c, p = self.config, self.covariance  # edited in place: it is the largest part by far
         dt_s = self.since.s
-        scale, _ = self.errors.unbind(-1)
         d = self.moved_m
-        lever = torch.stack([-d / (1.0 - scale).unsqueeze(-1), d.flip(-1) * d.new_tensor([1, -1])],
-                            dim=-1)  # fmt: skip
-        top = p[:, :2, :] + lever @ p[:, 2:4, :]
-        p = torch.cat([top, p[:, 2:, :]], dim=1)
-        p = torch.cat([p[:, :, :2] + p[:, :, 2:4] @ lever.mT, p[:, :, 2:]], dim=2)
-        along, across = c.speed_factor**2, math.radians(c.heading_white_deg) ** 2
-        total = self.spread_m2.diagonal(dim1=-2, dim2=-1).sum(-1)
-        still = 0.5 * c.speed_add_m_s**2 * self.since.squares_s2 + across * total
-        p[:, :2, :2] += (along - across) * self.spread_m2
-        p[:, 0, 0] += still
-        p[:, 1, 1] += still
+        lever = torch.stack(
+            [d / (self.errors[:, :1] - 1.0), d.flip(-1) * d.new_tensor([1.0, -1.0])], dim=-1
+        )
+        p[:, :2, :] += lever @ p[:, 2:4, :]
+        p[:, :, :2] += p[:, :, 2:4] @ lever.mT
+        share = 0.5 * (c.speed_factor**2 + math.radians(c.heading_white_deg) ** 2)
+        spread = share * self.squares_m2 + 0.5 * c.speed_add_m_s**2 * self.since.squares_s2
+        p[:, 0, 0] += spread
+        p[:, 1, 1] += spread
         stays = math.exp(-dt_s / c.heading_slow_s)
         if compass:
             p[:, 3, :] *= stays
             p[:, :, 3] *= stays
             self.errors = self.errors * self.errors.new_tensor([1.0, stays])
         p[:, 3, 3] += math.radians(c.heading_slow_deg) ** 2 * (1.0 - stays * stays)
-        self.covariance = p
         self.start_anew()
 
     def _meet(
@@ -304,13 +295,10 @@ class WallMemory(Running):
             moves[rows, OWN + slot] - normal[:, 0] * moves[:, 0] - normal[:, 1] * moves[:, 1]
             - half * moves[:, 3] + c.sigma_m**2 + (half * math.radians(c.sigma_deg)).square()
         )  # fmt: skip
-        self.innovation = torch.maximum(
-            self.innovation, (off.abs() / variance.sqrt()).where(use, 0.0)
-        )
         use = use & (off.square() < c.gate**2 * variance)
         gain = (moves / variance.unsqueeze(-1)).where(use.unsqueeze(-1), 0.0)
         change = gain * off.unsqueeze(-1)
-        self.covariance = p - gain.unsqueeze(-1) * moves.unsqueeze(-2)
+        torch.baddbmm(p, gain.unsqueeze(-1), moves.unsqueeze(-2), alpha=-1.0, out=p)
         self._apply(change)
         return position + change[:, :2]
 
@@ -389,12 +377,12 @@ class WallMemory(Running):
             anchors = self.walls[row, self.active[row], :2]
             slot = int((anchors - position).square().sum(-1).argmax())
             self.walls = self._up_to_date()
-        covariance, active = self.covariance.clone(), self.active.clone()
+        covariance, active = self.covariance, self.active.clone()
         covariance[row, OWN + slot, :] = 0.0
         covariance[row, :, OWN + slot] = 0.0
         covariance[row, OWN + slot, OWN + slot] = self.walls[row, wall, 4]
         active[row, slot] = wall
-        self.covariance, self.active = covariance, active
+        self.active = active
         return slot
 
     def _up_to_date(self) -> Tensor:
