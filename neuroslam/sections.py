@@ -254,6 +254,9 @@ class WallMemoryConfig(Section):
     heading_slow_deg: float = Field(1.0, ge=0, description="error of heading that changes slowly")
     heading_slow_s: float = Field(120.0, gt=0, description="within this time")
     gate: float = Field(5.0, gt=0, description="standard deviations; farther off is another wall")
+    view_sigma_m: float = Field(
+        0.3, gt=0, description="how far from where a view was learnt it may be recognised"
+    )
     lost_after_s: float = Field(
         2.0, gt=0, description="walls contradict the memory for so long: the animal is lost"
     )

@@ -90,7 +90,7 @@ class PoseEstimate(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """What the brain says after one frame; the columns of ``frames.csv``."""
+    """What the brain says after one frame; but for ``lost``, the columns of ``frames.csv``."""
 
     frame: int
     time_s: float
@@ -103,3 +103,4 @@ class StepResult(NamedTuple):
     n_templates: int
     n_experiences: int
     n_links: int
+    lost: bool = False

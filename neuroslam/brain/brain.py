@@ -13,20 +13,25 @@ from neuroslam.brain.matching import shared_history
 from neuroslam.brain.merge import Match, differing_keys, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.brain.sessions import Session, SessionLog, session_id
+from neuroslam.cells.boundary import check_walls
+from neuroslam.cells.navigation import NavigationCells, Whereabouts
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.geometry import compose
+from neuroslam.geometry import TWO_PI, compose
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.population import Population, Running, State
+from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.storage import Scalars
 from neuroslam.types import (
+    NO_EXPERIENCE,
     NO_TEMPLATE,
     Frame,
     Motion,
     Pose,
+    PoseEstimate,
     StepResult,
     Velocity,
     ViewMatch,
@@ -78,6 +83,8 @@ class NavigationBrain(nn.Module):
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
         )
+        if config.cells != "pose":
+            self.navigation = NavigationCells(config)
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
@@ -102,7 +109,9 @@ class NavigationBrain(nn.Module):
         """
         try:
             dt_s = self._elapsed(frame)
-            seen = None if frame.image is None else self.view.look(frame.image)
+            felt = self._felt(frame)
+            looks = frame.image is not None and self.config.cells != "place"
+            seen = self.view.look(frame.image) if looks else None
             velocity = self._velocity(frame, dt_s)
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
@@ -114,17 +123,28 @@ class NavigationBrain(nn.Module):
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         motion = Motion(*velocity, dt_s)
+        where = None
+        if self.config.cells != "pose":
+            where = self.navigation.live(motion, frame.heading_rad, felt)
         self.continuity.moved(velocity, dt_s)
         view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
             self._name_session(frame)
-        cells = self.pose_cells(motion, view)
-        action, experience = self.map(motion, view, cells, frame.index)
+        if self.config.cells == "place":
+            cells = PoseEstimate(*self.navigation.oscillators.position_m.tolist(), 0.0)
+            place = NO_EXPERIENCE if where.lost else int(where.place)
+            action, experience = self.map.visit(place, self.navigation.pose, dt_s, frame.index)
+        else:
+            cells = self.pose_cells(motion, view)
+            action, experience = self.map(motion, view, cells, frame.index)
+            if where is not None:
+                self._correct(where)
+                self.navigation.see(view)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
         self.clock.after_gap_s = -math.inf
         self.sessions.now.frames += 1
-        if len(self.stored) and action in ("create", "link") and self._recognise(frame, seen, view):
+        if seen is not None and action in ("create", "link") and self._recognise(frame, seen, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.pose_cells.estimate, "set", self.map.current
         return StepResult(
@@ -139,7 +159,36 @@ class NavigationBrain(nn.Module):
             n_templates=self.view.n,
             n_experiences=self.map.n,
             n_links=self.map.n_links,
+            lost=where is not None and bool(where.lost),
         )
+
+    def _felt(self, frame: Frame) -> np.ndarray | None:
+        """Find the walls around, ``(n, 2)``, where the brain has cells for them; checked."""
+        if self.config.cells == "pose":
+            return None
+        if frame.heading_rad is not None and not math.isfinite(frame.heading_rad):
+            raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
+        if frame.walls is not None:
+            check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
+            return frame.walls
+        if frame.ranges is None:
+            return None
+        return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
+
+    def _correct(self, where: Whereabouts) -> None:
+        """Let pose cells and map follow a correction that walls have made."""
+        x, y = where.correction_m.tolist()
+        if x == y == 0.0:
+            return
+        heading = self.navigation.now.heading_rad
+        cells = self.config.pose_cells
+        for move, facing, unit in (
+            (self.map.nudge, self.map.pose.theta_rad, 1.0),
+            (self.pose_cells.nudge, TWO_PI * self.pose_cells.estimate.theta / cells.n_theta,
+             cells.cell_size_m),
+        ):  # fmt: skip
+            c, si = math.cos(facing - heading) / unit, math.sin(facing - heading) / unit
+            move(c * x - si * y, si * x + c * y)
 
     def store(self, other: "NavigationBrain") -> None:
         """Remember the maps of another brain; when one is recognised, it is joined to this map.
@@ -245,6 +294,8 @@ class NavigationBrain(nn.Module):
     def _recognise(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
         """Join a stored map if this place is surely one of it."""
         config, recognition = self.config.sessions, self.recognition
+        if not len(self.stored):
+            return False
         recognition.arrive(WINDOW * config.confirm)
         if self._stored_views is None:
             self._stored_views = StoredViews([one.view for one in self.stored])

@@ -3,18 +3,22 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroslam.cells.boundary import BoundaryCells, check_walls
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
+from neuroslam.cells.joining import join_navigation
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
-from neuroslam.population import Running
-from neuroslam.storage import Scalars
+from neuroslam.geometry import wrap_angle
+from neuroslam.population import Join, Population, State
+from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.types import NO_TEMPLATE, Motion, Pose, ViewMatch
 
 FAMILIARITY_PERIOD_S = 0.5
 """Time between looks at whether a place is what it was."""
@@ -38,7 +42,7 @@ class Whereabouts(NamedTuple):
     lost: Tensor
 
 
-class NavigationCells(Running):
+class NavigationCells(Population):
     """Boundary, grid and place cells of an animal that knows its motion and the walls around.
 
     Self-motion turns the oscillators' phases, whose pattern the grid cells tell; walls correct the
@@ -72,7 +76,20 @@ class NavigationCells(Running):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
-        self.now = Scalars(since_s=0.0, someone_lost=0)
+        self.now = Scalars(
+            since_s=0.0,
+            someone_lost=0,
+            heading_rad=math.radians(config.map.initial_heading_deg),
+            turned_rad=0.0,  # of the compass, since the map was turned in a merge
+            last_view=NO_TEMPLATE,
+            views_agree=0,  # that the animal is off by so much
+            off_x_m=0.0,
+            off_y_m=0.0,
+        )
+        # Where each view was learnt; 0 in `sure` where the animal did not know.
+        self.seen = GrowingTable(
+            {name: ((), torch.float64) for name in ("x_m", "y_m", "heading_rad", "sure")}
+        )
 
     def forward(
         self,
@@ -133,3 +150,97 @@ class NavigationCells(Running):
             place.recruited,
             lost if self.batch is not None else lost[0],
         )
+
+    def live(
+        self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
+    ) -> Whereabouts:
+        """Take in a frame of one animal; :meth:`forward` with what a frame has.
+
+        Args:
+            motion: Since the last frame.
+            compass_rad: Measured heading; ``None``: it is integrated from the turns.
+            walls: Distance (m) and bearing relative to the heading (rad) of each, ``(n, 2)``.
+
+        Raises:
+            BadFrame: If a number cannot be; nothing has changed then.
+        """
+        now, compass = self.now, compass_rad is not None
+        heading = (
+            wrap_angle(compass_rad + now.turned_rad)
+            if compass
+            else wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
+        )
+        felt = torch.empty((0, 2), dtype=torch.float64)
+        if walls is not None and len(walls):
+            felt = torch.from_numpy(np.asarray(walls, dtype=np.float64))
+            felt = felt[felt[:, 0].argsort()]
+        device = self.walls.errors.device
+        numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)
+        felt = felt.to(device)
+        here = self(*numbers, motion.dt_s, felt[:, 0], felt[:, 1], compass=compass)
+        now.heading_rad = heading
+        return here
+
+    @property
+    def pose(self) -> Pose:
+        """Position and heading of one animal, with what was learnt of the heading's error."""
+        x, y = self.oscillators.position_m.tolist()
+        return Pose(x, y, wrap_angle(self.now.heading_rad - self.walls.errors[0, 1].item()))
+
+    def see(self, view: ViewMatch) -> bool:
+        """Learn where a new view is, or be corrected by where a known one was learnt.
+
+        A view near where it was learnt corrects the position a little. Where several views in a row
+        agree that the animal is somewhere else, it was carried there, or lost: it goes there.
+
+        Returns:
+            Whether it did.
+        """
+        now = self.now
+        here = self.pose
+        if view.is_new:
+            self.seen.append(
+                x_m=here.x_m,
+                y_m=here.y_m,
+                heading_rad=here.theta_rad - view.relative_heading_rad,
+                sure=float(not now.someone_lost),
+            )
+        known = view.template not in (NO_TEMPLATE, now.last_view) and not view.is_new
+        now.last_view = view.template
+        if not known or not self.seen["sure"][view.template]:
+            return False
+        x, y, heading = (self.seen[c][view.template].item() for c in ("x_m", "y_m", "heading_rad"))
+        off_x, off_y, sigma = x - here.x_m, y - here.y_m, self.config.wall_memory.view_sigma_m
+        if math.hypot(off_x, off_y) <= 3.0 * sigma:
+            now.views_agree = 0
+            target = self.oscillators.position_m.new_tensor([x, y])
+            step = self.walls.observe_position(self.oscillators.position_m, target, sigma)
+            self.oscillators.shift(step)
+            return False
+        again = math.hypot(off_x - now.off_x_m, off_y - now.off_y_m) <= 3.0 * sigma
+        now.views_agree = now.views_agree + 1 if again else 1
+        now.off_x_m, now.off_y_m = off_x, off_y
+        needed = self.config.sessions.confirm
+        if now.views_agree < (max(2, needed // 2) if now.someone_lost else needed):
+            return False
+        self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
+        return True
+
+    def go_to(self, pose: Pose, sigma_m: float) -> None:
+        """Set pose and phases of one animal anew; what it remembers stays.
+
+        Args:
+            pose: Where it is; a measured heading is kept.
+            sigma_m: How sure that is.
+        """
+        now = self.now
+        self.oscillators.place_at(self.oscillators.position_m.new_tensor([pose.x_m, pose.y_m]))
+        now.heading_rad = wrap_angle(pose.theta_rad + self.walls.errors[0, 1].item())
+        self.walls.forget_position(sigma_m)
+        self.familiarity.reset_doubt()
+        now.someone_lost = now.views_agree = 0
+
+    @staticmethod
+    def merged(loaded: State, partial: State, join: Join) -> State:
+        """Join places, walls and views of two sessions in the frame of the loaded one."""
+        return join_navigation(loaded, partial, join)

@@ -119,7 +119,7 @@ class VelocityOscillators(Running):
         kind = torch.float64
         self.spacing_m = nn.Parameter(torch.tensor(config.spacings_m, dtype=kind))
         angles = torch.tensor(config.orientations_deg, dtype=kind).deg2rad()
-        self.register_buffer("orientation_rad", angles, persistent=False)
+        self.register_buffer("orientation_rad", angles)
         start = torch.zeros(*lead, len(angles), config.directions, 2, dtype=kind)
         start[..., 0] = 1.0
         self.register_buffer("phases", start)

@@ -17,7 +17,11 @@ _SLACK_M = 0.06  # the animal may move so far before the window is looked up ane
 _STILL = 1 / 6  # of the distance between cells; who moved less has the same winner
 _ROOM = 64  # cells that a table begins with
 _NO_CELL = -1
-_FAR_M = 1e6
+FAR_M = 1e6
+"""Where a cell lies that there is none of."""
+
+EMPTY = {"weights": 0.0, "centres_m": FAR_M, "visits": 0, "time_s": 0.0, "neighbours": _NO_CELL}
+"""Columns of the table of cells, and what stands where there is none."""
 
 
 class PlaceResponse(NamedTuple):
@@ -103,6 +107,7 @@ class CompetitiveHebbianPlaceCells(Running):
     window: Tensor
     landmarks_m: Tensor
     leash_m2: Tensor
+    threshold_m: Tensor
 
     def __init__(self, config: PlaceCellConfig, n_grid: int, batch: int | None = None) -> None:
         super().__init__()
@@ -111,7 +116,7 @@ class CompetitiveHebbianPlaceCells(Running):
         b = batch or 1
         self.register_buffer("n_cells", torch.zeros(b, dtype=torch.int64))
         self.register_buffer("weights", torch.zeros(b, _ROOM, n_grid))
-        self.register_buffer("centres_m", torch.full((b, _ROOM, 2), _FAR_M, dtype=torch.float64))
+        self.register_buffer("centres_m", torch.full((b, _ROOM, 2), FAR_M, dtype=torch.float64))
         self.register_buffer("visits", torch.zeros(b, _ROOM, dtype=torch.int64))
         self.register_buffer("time_s", torch.zeros(b, _ROOM, dtype=torch.float64))
         none = torch.full((b, _ROOM, NEIGHBOURS), _NO_CELL, dtype=torch.int64)
@@ -119,9 +124,10 @@ class CompetitiveHebbianPlaceCells(Running):
         self.register_buffer("winner", torch.full((b,), _NO_CELL, dtype=torch.int64))
         self.register_buffer("window", torch.arange(_WINDOW).repeat(b, 1))
         # Where the cells competed last, and where the window was looked up.
-        self.register_buffer("landmarks_m", torch.full((2, b, 2), _FAR_M, dtype=torch.float64))
+        self.register_buffer("landmarks_m", torch.full((2, b, 2), FAR_M, dtype=torch.float64))
         leash = torch.tensor([[_STILL * config.threshold_m], [_SLACK_M]], dtype=torch.float64)
         self.register_buffer("leash_m2", leash.square(), persistent=False)
+        self.register_buffer("threshold_m", torch.tensor(config.threshold_m, dtype=torch.float64))
         self.now = Scalars(stay_s=0.0)
         self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
         self.register_state_dict_pre_hook(lambda module, *_: module._write_back())
@@ -304,18 +310,15 @@ class CompetitiveHebbianPlaceCells(Running):
             self.neighbours[rows[add], start[add], slot[add]] = end[add]
 
     def _grow(self) -> None:
-        for name, empty in _EMPTY.items():
+        for name, empty in EMPTY.items():
             old = getattr(self, name)
             setattr(self, name, torch.cat([old, torch.full_like(old, empty)], dim=1))
-
-
-_EMPTY = {"weights": 0.0, "centres_m": _FAR_M, "visits": 0, "time_s": 0.0, "neighbours": _NO_CELL}
 
 
 def _take_capacity(
     module: torch.nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
 ) -> None:
-    for name in _EMPTY:
+    for name in EMPTY:
         saved = state.get(prefix + name)
         if saved is not None and len(saved) == len(getattr(module, name)):
             setattr(module, name, getattr(module, name).new_empty(saved.shape))

@@ -75,6 +75,21 @@ def wall_innovation(
     return distance_m - wall.distance_m - dx * nx - dy * ny, normal, dy * nx - dx * ny
 
 
+def unlikeness(walls: Tensor, position_m: Tensor, bearing_rad: Tensor, scale: Tensor) -> Tensor:
+    r"""Say how unlike remembered walls are to one that is looked at; below 1 it is the same.
+
+    .. math:: \frac{|x_m - x|^2}{s^2} + \frac{(\alpha_m - \alpha)^2}{a^2}
+
+    Args:
+        walls: Rows as in :class:`Wall`, ``(..., 5)``.
+        position_m: :math:`x`, ``(..., 2)``.
+        bearing_rad: :math:`\alpha`, ``(...)``.
+        scale: :math:`s` in metres, :math:`a` in radians.
+    """
+    away = (walls[..., :2] - position_m).square().sum(-1) / scale[0].square()
+    return away + (wrap(walls[..., 2] - bearing_rad) / scale[1]).square()
+
+
 class WallMemory(Running):
     """Remembered walls of an animal, and its belief about its own errors.
 
@@ -103,6 +118,7 @@ class WallMemory(Running):
     errors: Tensor
     moved_m: Tensor
     squares_m2: Tensor
+    scale: Tensor
 
     def __init__(self, config: WallMemoryConfig, batch: int | None = None) -> None:
         super().__init__()
@@ -116,6 +132,8 @@ class WallMemory(Running):
         self.register_buffer("errors", torch.zeros(b, 2, **kind))
         self.register_buffer("moved_m", torch.zeros(b, 2, **kind))
         self.register_buffer("squares_m2", torch.zeros(b, **kind))
+        scale = torch.tensor([config.spread_m, math.radians(config.spread_deg)], **kind)
+        self.register_buffer("scale", scale)  # within which a wall is one: m, rad
         self.since = Scalars(s=0.0, squares_s2=0.0)
         variances = [0.0, 0.0, config.speed_scale**2, math.radians(config.heading_slow_deg) ** 2]
         self.covariance[:] = torch.diag(torch.tensor(variances, **kind))
@@ -191,7 +209,12 @@ class WallMemory(Running):
             if not bool(seen.any()):
                 break
             position = self._meet(
-                position, distance[:, wall].where(seen, 0.0), bearing[:, wall], seen, learns
+                position,
+                distance[:, wall].where(seen, 0.0),
+                bearing[:, wall],
+                seen,
+                learns,
+                compass,
             )
         correction = position - start
         return correction[0] if one else correction
@@ -271,12 +294,16 @@ class WallMemory(Running):
         bearing: Tensor,
         seen: Tensor,
         learns: Tensor | None,
+        compass: bool,
     ) -> Tensor:
         """Correct by one wall for each animal that sees one."""
         c = self.config
         rows = torch.arange(len(position), device=position.device)
         bearing = bearing - self.errors[:, 1]
         slot, known = self._find(position, bearing)
+        if not compass and bool((seen & known).any()):
+            change = self._turn_by(position, bearing, slot, seen & known)
+            position, bearing = position + change[:, :2], bearing - change[:, 3]
         missing = seen & ~known
         if bool(missing.any()):
             slot, known = self._recall(position, distance, bearing, slot, known, missing, learns)
@@ -302,6 +329,30 @@ class WallMemory(Running):
         self._apply(change)
         return position + change[:, :2]
 
+    def _turn_by(self, position: Tensor, bearing: Tensor, slot: Tensor, use: Tensor) -> Tensor:
+        r"""Learn the error of an integrated heading from the bearings of known walls.
+
+        .. math:: \nu = \alpha - \alpha_m
+
+        A wall is seen under the bearing it was remembered with, but for how it curves along the
+        lever: at most by the lever over four times ``spread_m``.
+
+        Returns:
+            The change of position, errors and distances, ``(batch, n)``.
+        """
+        rows = torch.arange(len(position), device=position.device)
+        wall = Wall(*self.walls[rows, self.active[rows, slot].clamp_min(0)].unbind(-1))
+        _, _, lever = wall_innovation(position, torch.zeros_like(bearing), bearing, wall)
+        c, p = self.config, self.covariance
+        width = 2.0 * math.radians(c.sigma_deg)
+        variance = p[:, 3, 3] + width**2 + (lever / (4.0 * c.spread_m)).square()
+        gain = (p[:, 3] / variance.unsqueeze(-1)).where(use.unsqueeze(-1), 0.0)
+        change = gain * wrap(bearing - wall.bearing_rad).unsqueeze(-1)
+        heading = p[:, 3].clone()
+        torch.baddbmm(p, gain.unsqueeze(-1), heading.unsqueeze(-2), alpha=-1.0, out=p)
+        self._apply(change)
+        return change
+
     def _apply(self, change: Tensor) -> None:
         """Change the learnt errors and the remembered distances."""
         self.errors = self.errors + change[:, 2:OWN]
@@ -324,10 +375,7 @@ class WallMemory(Running):
         return slot, least < 1.0
 
     def _unlike(self, walls: Tensor, position: Tensor, bearing: Tensor) -> Tensor:
-        c = self.config
-        away = (walls[..., :2] - position.unsqueeze(-2)).square().sum(-1) / c.spread_m**2
-        turned = wrap(walls[..., 2] - bearing.unsqueeze(-1)) / math.radians(c.spread_deg)
-        return away + turned.square()
+        return unlikeness(walls, position.unsqueeze(-2), bearing.unsqueeze(-1), self.scale)
 
     def _recall(
         self, position: Tensor, distance: Tensor, bearing: Tensor,

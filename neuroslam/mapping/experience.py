@@ -201,6 +201,46 @@ class ExperienceMap(Population):
         self._drop_finished_goals()
         return action, self.state.current
 
+    def visit(self, place: int, pose: Pose, elapsed_s: float, frame: int) -> tuple[Action, int]:
+        """Take in where place cells say that the robot is; each of them is an experience.
+
+        Args:
+            place: Number of the place cell; that of the next experience for a new one; -1 where
+                the robot does not know its place.
+            pose: Of the robot, on this map.
+            elapsed_s: Time since the last frame.
+            frame: Number of the frame.
+
+        Returns:
+            What was done, and the experience the robot is at.
+        """
+        action: Action = "none"
+        self.state.since_s += elapsed_s
+        self.state.time_s += elapsed_s
+        self.stand(pose)
+        if place not in (NO_EXPERIENCE, self.state.current):
+            action = "create" if place == self.n else "link"
+            if action == "create":
+                self.create(NO_TEMPLATE, PoseEstimate(0.0, 0.0, 0.0), frame)
+            else:
+                self.link(place)
+            self.stand(pose)
+        self._drop_finished_goals()
+        return action, self.state.current
+
+    def stand(self, pose: Pose) -> None:
+        """Put the robot somewhere; it stays at the experience it is at."""
+        s = self.state
+        x = y = 0.0
+        if s.current != NO_EXPERIENCE:
+            x, y, _ = self.experiences["pose"][s.current].tolist()
+        s.dx_m, s.dy_m, s.facing_rad = pose.x_m - x, pose.y_m - y, wrap_angle(pose.theta_rad)
+
+    def nudge(self, dx_m: float, dy_m: float) -> None:
+        """Move the robot a little, as something else has corrected its position."""
+        self.state.dx_m += dx_m
+        self.state.dy_m += dy_m
+
     def move(self, motion: Motion) -> None:
         """Accumulate odometry: turn, then move along the new heading."""
         s = self.state

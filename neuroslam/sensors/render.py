@@ -205,6 +205,24 @@ def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]
     return [describe(np.argmax((top - eye_m) / depth, axis=1)), near]
 
 
+def measure_ranges(world: World, pose: Pose, n_beams: int, eye_m: float) -> np.ndarray:
+    """Return what a scanner measures: distances to walls and pillars, without noise.
+
+    Args:
+        world: The world.
+        pose: Of the scanner.
+        n_beams: Beams, evenly over the full turn, counter-clockwise from straight ahead.
+        eye_m: Its height above the floor.
+
+    Returns:
+        Metres, ``(n_beams,)``; ``inf`` where nothing is met.
+    """
+    angle = pose.theta_rad + 2.0 * math.pi * np.arange(n_beams) / n_beams
+    rays = np.column_stack([np.cos(angle), np.sin(angle)])
+    depth = cast(world, pose, rays, eye_m)[-1].depth
+    return np.where(depth < _NEVER, depth, np.inf)
+
+
 def _draw_upright(
     atlas: Atlas,
     hits: Hits,

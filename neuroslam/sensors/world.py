@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.sensors.options import parse_options
-from neuroslam.sensors.render import Camera, render
+from neuroslam.sensors.render import Camera, measure_ranges, render
 from neuroslam.sensors.scene import Billboard, World
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.worlds import build_world, catalogue
@@ -105,6 +105,8 @@ class WorldOptions(BaseModel):
     light: float = Field(0.0, ge=0, lt=1, description="share by which brightness drifts")
     gain: float = Field(1.0, gt=0, le=10, description="factor on the brightness of all frames")
     people: int = Field(0, ge=0, le=50, description="passers-by")
+    ranges: int = Field(0, ge=0, le=3600, description="beams of a range scanner all around")
+    range_noise_m: float = Field(0.01, ge=0, description="error of each beam")
 
     def odometry_noise(self) -> OdometryNoise:
         """Return the noise that ``noise`` and the single terms ask for together."""
@@ -229,7 +231,14 @@ class WorldSource(IndexedSource):
         if self.options.grey:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         velocity = Velocity(*self._velocities[index].tolist()) if self._has_odometry else None
-        return Frame(index, time_s, image=image, velocity=velocity, truth=pose)
+        ranges = self._measure(index, pose) if self.options.ranges else None
+        return Frame(index, time_s, image=image, velocity=velocity, ranges=ranges, truth=pose)
+
+    def _measure(self, index: int, pose: Pose) -> np.ndarray:
+        options = self.options
+        ranges = measure_ranges(self.world, pose, options.ranges, self.camera.camera_height_m)
+        noise = np.random.default_rng([options.seed, 3, index]).standard_normal(len(ranges))
+        return np.maximum(ranges + options.range_noise_m * noise, 0.0)
 
 
 def open_world(spec: str) -> WorldSource:
