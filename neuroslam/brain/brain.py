@@ -123,9 +123,11 @@ class NavigationBrain(nn.Module):
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         motion = Motion(*velocity, dt_s)
-        where = None
+        where, turn_rad = None, 0.0
         if self.config.cells != "pose":
+            turn_rad = self.navigation.heading_error_rad
             where = self.navigation.live(motion, frame.heading_rad, felt)
+            turn_rad -= self.navigation.heading_error_rad
         self.continuity.moved(velocity, dt_s)
         view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
@@ -138,7 +140,7 @@ class NavigationBrain(nn.Module):
             cells = self.pose_cells(motion, view)
             action, experience = self.map(motion, view, cells, frame.index)
             if where is not None:
-                self._correct(where)
+                self._correct(where, turn_rad)
                 self.navigation.see(view)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
@@ -175,20 +177,18 @@ class NavigationBrain(nn.Module):
             return None
         return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
 
-    def _correct(self, where: Whereabouts) -> None:
-        """Let pose cells and map follow a correction that walls have made."""
+    def _correct(self, where: Whereabouts, turn_rad: float) -> None:
+        """Let pose cells and map follow what walls have corrected."""
         x, y = where.correction_m.tolist()
-        if x == y == 0.0:
+        if x == y == turn_rad == 0.0:
             return
-        heading = self.navigation.now.heading_rad
-        cells = self.config.pose_cells
-        for move, facing, unit in (
-            (self.map.nudge, self.map.pose.theta_rad, 1.0),
-            (self.pose_cells.nudge, TWO_PI * self.pose_cells.estimate.theta / cells.n_theta,
-             cells.cell_size_m),
-        ):  # fmt: skip
-            c, si = math.cos(facing - heading) / unit, math.sin(facing - heading) / unit
-            move(c * x - si * y, si * x + c * y)
+        heading, cells = self.navigation.pose.theta_rad, self.config.pose_cells
+        facing = TWO_PI * self.pose_cells.estimate.theta / cells.n_theta
+        self.map.nudge(*_rotated(x, y, self.map.pose.theta_rad - heading), turn_rad)
+        self.pose_cells.nudge(
+            *(way / cells.cell_size_m for way in _rotated(x, y, facing - heading)),
+            turn_rad * cells.n_theta / TWO_PI,
+        )
 
     def store(self, other: "NavigationBrain") -> None:
         """Remember the maps of another brain; when one is recognised, it is joined to this map.
@@ -417,6 +417,11 @@ class NavigationBrain(nn.Module):
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
         return self.odometry(frame.image, dt_s)
+
+
+def _rotated(x: float, y: float, by_rad: float) -> tuple[float, float]:
+    c, s = math.cos(by_rad), math.sin(by_rad)
+    return c * x - s * y, s * x + c * y
 
 
 def _make_stored(module: NavigationBrain, state: State, prefix: str, *_unused: object) -> None:

@@ -182,10 +182,15 @@ class NavigationCells(Population):
         return here
 
     @property
+    def heading_error_rad(self) -> float:
+        """What was learnt of the heading's error, of one animal; it is taken off."""
+        return self.walls.errors[0, 1].item()
+
+    @property
     def pose(self) -> Pose:
         """Position and heading of one animal, with what was learnt of the heading's error."""
         x, y = self.oscillators.position_m.tolist()
-        return Pose(x, y, wrap_angle(self.now.heading_rad - self.walls.errors[0, 1].item()))
+        return Pose(x, y, wrap_angle(self.now.heading_rad - self.heading_error_rad))
 
     def see(self, view: ViewMatch) -> bool:
         """Learn where a new view is, or be corrected by where a known one was learnt.
@@ -235,7 +240,7 @@ class NavigationCells(Population):
         """
         now = self.now
         self.oscillators.place_at(self.oscillators.position_m.new_tensor([pose.x_m, pose.y_m]))
-        now.heading_rad = wrap_angle(pose.theta_rad + self.walls.errors[0, 1].item())
+        now.heading_rad = wrap_angle(pose.theta_rad + self.heading_error_rad)
         self.walls.forget_position(sigma_m)
         self.familiarity.reset_doubt()
         now.someone_lost = now.views_agree = 0

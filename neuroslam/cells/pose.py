@@ -176,9 +176,9 @@ class PoseCellNetwork(Population):
             self._measure_slip(before, distance, turn)
         return self.estimate
 
-    def nudge(self, dx_cells: float, dy_cells: float) -> None:
-        """Move the belief along x and y, as something else has corrected the position."""
-        self.packet = path_integrate(self.packet, 0.0, 0.0, (dx_cells, dy_cells))
+    def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
+        """Move and turn the belief a little, as something else has corrected the pose."""
+        self.packet = path_integrate(self.packet, 0.0, turn_cells, (dx_cells, dy_cells))
 
     def _measure_slip(
         self, before: PoseEstimate | Tensor, distance: float | Tensor, turn: float | Tensor

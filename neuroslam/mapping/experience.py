@@ -236,10 +236,12 @@ class ExperienceMap(Population):
             x, y, _ = self.experiences["pose"][s.current].tolist()
         s.dx_m, s.dy_m, s.facing_rad = pose.x_m - x, pose.y_m - y, wrap_angle(pose.theta_rad)
 
-    def nudge(self, dx_m: float, dy_m: float) -> None:
-        """Move the robot a little, as something else has corrected its position."""
-        self.state.dx_m += dx_m
-        self.state.dy_m += dy_m
+    def nudge(self, dx_m: float, dy_m: float, turn_rad: float) -> None:
+        """Move and turn the robot a little, as something else has corrected its pose."""
+        s = self.state
+        s.dx_m += dx_m
+        s.dy_m += dy_m
+        s.facing_rad = wrap_angle(s.facing_rad + turn_rad)
 
     def move(self, motion: Motion) -> None:
         """Accumulate odometry: turn, then move along the new heading."""
