@@ -7,6 +7,7 @@ import numpy as np
 from neuroslam.brain.limits import elsewhere, far_off, tolerance
 from neuroslam.brain.merge import Match, differing_keys
 from neuroslam.brain.sessions import session_name
+from neuroslam.brain.wall_matching import match_walls
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
 from neuroslam.mapping.tables import Origins, origin_key
@@ -52,6 +53,8 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     shared = shared_history(loaded, partial)
     if shared is not None:
         return shared
+    if partial.config.cells == "place":
+        return Found(*match_walls(loaded, partial))
     pairs, best = _alike(loaded, partial)
     threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
     if not len(pairs.partial):
@@ -136,10 +139,7 @@ def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Fou
     if not len(i):
         return None
     one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
-    pixels = [
-        brain.view.templates["pixels"].numpy(force=True)[brain.map.experiences["template"].numpy()[o.experience]]
-        for brain, o in ((loaded, one), (partial, other))
-    ]  # fmt: skip
+    pixels = [_pixels(loaded, one.experience), _pixels(partial, other.experience)]
     aliased = (np.isin(keys[0][i], origin_key(_aliases(loaded.map)))
                | np.isin(keys[1][j], origin_key(_aliases(partial.map))))  # fmt: skip
     differ = one.first_frame != other.first_frame
@@ -165,6 +165,14 @@ def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Fou
     return Found(
         match, f"{len(pairs.partial)} places are of sessions that both maps hold", (len(i),)
     )
+
+
+def _pixels(brain: "NavigationBrain", places: np.ndarray) -> np.ndarray:
+    """Return the views of places, one row each; of what has none, a row that is equal to all."""
+    views = brain.map.experiences["template"].numpy()[places]
+    if not brain.view.n:
+        return np.zeros((len(places), 1))
+    return brain.view.templates["pixels"].numpy(force=True)[views].reshape(len(places), -1)
 
 
 def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.joining import links_kept
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.population import Join, Population, State
-from neuroslam.types import Pose
+from neuroslam.types import NO_TEMPLATE, Pose
 
 if TYPE_CHECKING:
     from neuroslam.brain.brain import NavigationBrain
@@ -41,6 +41,8 @@ class Match(NamedTuple):
         error: Mean difference of the views.
         runner_up: That of the most similar view of any other place, where it was looked for.
         others: Further places that are the same, if any.
+        onto: Where :math:`e_z` comes to lie, where that is known better than that it is
+            :math:`e_u`.
     """
 
     loaded: int
@@ -49,6 +51,7 @@ class Match(NamedTuple):
     error: float = 0.0
     runner_up: float | None = None
     others: Pairs = Pairs.of([])
+    onto: Pose | None = None
 
     @property
     def pairs(self) -> Pairs:
@@ -137,7 +140,12 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
         ['view.threshold is 0.05 and 0.04']
     """
     differing = []
-    for section in ("view", "pose_cells"):
+    sections = ["view", "pose_cells"]
+    if one.cells != other.cells:
+        differing.append(f"cells is {one.cells} and {other.cells}")
+    elif one.cells != "pose":
+        sections += ["boundary_cells", "grid_cells", "place_cells"]
+    for section in sections:
         first, second = (getattr(config, section).model_dump() for config in (one, other))
         differing += [
             f"{section}.{key} is {first[key]} and {second[key]}"
@@ -181,7 +189,9 @@ def make_join(loaded: State, partial: State, match: Match, config: BrainConfig) 
     pivot = Pose(*places["partial"][match.partial].tolist())
     x, y, theta = places["loaded"][match.loaded].tolist()
     shift, view_cells, experience_cells = _move_cells(loaded, partial, match, config)
-    turns = view_turns[views["partial"]]
+    turns = np.zeros(len(views["partial"]))
+    has_view = views["partial"] != NO_TEMPLATE  # a place without a camera has none
+    turns[has_view] = view_turns[views["partial"][has_view]]
     turns[pairs.partial] = pairs.turn_rad
     return Join(
         views=_numbered(len(view_ids), n_views, np.flatnonzero(view_ids >= 0),
@@ -196,7 +206,7 @@ def make_join(loaded: State, partial: State, match: Match, config: BrainConfig) 
         view_cells=view_cells,
         experience_cells=experience_cells,
         pivot=pivot,
-        onto=Pose(x, y, wrap_angle(theta + match.turn_rad)),
+        onto=match.onto or Pose(x, y, wrap_angle(theta + match.turn_rad)),
     )  # fmt: skip
 
 
@@ -215,7 +225,7 @@ def _move_cells(
     shift = loaded["map.experiences.cell"].numpy()[match.loaded] - pivot
     shift[2] += match.turn_rad * cells.n_theta / TWO_PI
     ways = view_ways = None
-    if config.sessions.cells == "none":
+    if config.sessions.cells == "none" or config.cells == "place":
         return np.zeros(3), bound, states
     if config.sessions.cells == "turn":
         angle = TWO_PI * pivot[2] / cells.n_theta - poses[match.partial, 2]
@@ -250,6 +260,8 @@ def _fold_views(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Loaded view that each partial one becomes, by its most similar pair; -1 where it stays."""
     ids, turns = np.full(n, -1, dtype=np.int64), np.zeros(n)
+    has_view = (partial != NO_TEMPLATE) & (loaded != NO_TEMPLATE)
+    partial, loaded, pairs = partial[has_view], loaded[has_view], pairs.pick(has_view)
     best = np.lexsort((pairs.error, np.arange(len(partial)) != 0))[::-1]  # the match wins
     ids[partial[best]], turns[partial[best]] = loaded[best], pairs.turn_rad[best]
     return turns, ids
@@ -343,6 +355,8 @@ def merge(
     merged = type(partial)(partial.config)
     merged.take(state, [*map(deepcopy, loaded.stored), *map(deepcopy, partial.stored)])
     merged.to(partial.pose_cells.window.device)
+    if merged.config.cells == "place":
+        merged.map.measure_links()  # a place cell that became another's lies where that does
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded, partial, merged, join)
     if strain > allowed:

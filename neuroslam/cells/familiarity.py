@@ -83,6 +83,7 @@ class Familiarity(Running):
         self.register_buffer("slack", near.float(), persistent=False)
         self.register_load_state_dict_pre_hook(_take_capacity)
 
+    @torch.inference_mode()
     def forward(
         self, winner: Tensor, distance_m: Tensor, bearing_rad: Tensor, dt_s: float
     ) -> Tensor:

@@ -80,6 +80,7 @@ class NavigationCells(Population):
             since_s=0.0,
             someone_lost=0,
             heading_rad=math.radians(config.map.initial_heading_deg),
+            compass=0,
             turned_rad=0.0,  # of the compass, since the map was turned in a merge
             last_view=NO_TEMPLATE,
             views_agree=0,  # that the animal is off by so much
@@ -178,7 +179,7 @@ class NavigationCells(Population):
         numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)
         felt = felt.to(device)
         here = self(*numbers, motion.dt_s, felt[:, 0], felt[:, 1], compass=compass)
-        now.heading_rad = heading
+        now.heading_rad, now.compass = heading, int(compass)
         return here
 
     @property

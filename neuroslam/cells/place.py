@@ -142,6 +142,7 @@ class CompetitiveHebbianPlaceCells(Running):
     def _forget_window(self) -> None:
         self._near = None
 
+    @torch.inference_mode()
     def forward(
         self, grid: Tensor, position_m: Tensor, dt_s: float, *, learns: Tensor | None = None
     ) -> PlaceResponse:
@@ -195,6 +196,7 @@ class CompetitiveHebbianPlaceCells(Running):
             return PlaceResponse(self.winner, recruited, changed)
         return PlaceResponse(self.winner[0], recruited[0], changed[0])
 
+    @torch.inference_mode()
     def responses(self, grid: Tensor, position_m: Tensor | None = None) -> Tensor:
         """Return the responses of all cells, ``([batch,] n)``, zero where there is none.
 
@@ -281,6 +283,7 @@ class CompetitiveHebbianPlaceCells(Running):
             after = after.where(learns[:, None, None], before)
         near.scatter_(1, at, after)
 
+    @torch.inference_mode()
     def _write_back(self, rows: Tensor | None = None) -> None:
         """Bring what was learnt in the windows, of some animals or all, into the table."""
         if self._near is None:
@@ -288,6 +291,11 @@ class CompetitiveHebbianPlaceCells(Running):
         if rows is None:
             rows = torch.arange(len(self.window), device=self.window.device)
         self.weights[rows.unsqueeze(1), self.window[rows]] = self._near[0][rows]
+
+    def _apply(self, fn: object, recurse: bool = True) -> "CompetitiveHebbianPlaceCells":
+        self._write_back()
+        self._near = None
+        return super()._apply(fn, recurse)
 
     def _flush_time(self) -> None:
         """Credit the time since the winners last changed to them."""

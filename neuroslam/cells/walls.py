@@ -156,6 +156,7 @@ class WallMemory(Running):
             for rows, n in zip(self._up_to_date(), self.n_walls.tolist(), strict=True)
         ]
 
+    @torch.inference_mode()
     def move(self, speed_m_s: Tensor, heading_rad: Tensor, dt_s: float) -> Tensor:
         """Return the displacement in the world, ``([batch,] 2)``, with the learnt errors taken off.
 
@@ -174,6 +175,7 @@ class WallMemory(Running):
         self.since.squares_s2 += dt_s * dt_s
         return step if self.batch is not None else step[0]
 
+    @torch.inference_mode()
     def look(
         self,
         position_m: Tensor,
@@ -219,6 +221,7 @@ class WallMemory(Running):
         correction = position - start
         return correction[0] if one else correction
 
+    @torch.inference_mode()
     def observe_position(self, position_m: Tensor, seen_at_m: Tensor, sigma_m: float) -> Tensor:
         """Take in a position that something else tells, as a view does.
 
@@ -237,10 +240,11 @@ class WallMemory(Running):
         gain = torch.linalg.solve(spread, p[:, :2, :]).mT
         change = (gain @ off.unsqueeze(-1)).squeeze(-1)
         self.covariance = p - gain @ p[:, :2, :]
-        self._apply(change)
+        self._learn(change)
         correction = change[:, :2]
         return correction[0] if self.batch is None else correction
 
+    @torch.inference_mode()
     def forget_position(self, sigma_m: float) -> None:
         """Say that the position is unknown but for ``sigma_m``, as after it was set anew."""
         fresh = self.covariance.clone()
@@ -326,7 +330,7 @@ class WallMemory(Running):
         gain = (moves / variance.unsqueeze(-1)).where(use.unsqueeze(-1), 0.0)
         change = gain * off.unsqueeze(-1)
         torch.baddbmm(p, gain.unsqueeze(-1), moves.unsqueeze(-2), alpha=-1.0, out=p)
-        self._apply(change)
+        self._learn(change)
         return position + change[:, :2]
 
     def _turn_by(self, position: Tensor, bearing: Tensor, slot: Tensor, use: Tensor) -> Tensor:
@@ -350,10 +354,10 @@ class WallMemory(Running):
         change = gain * wrap(bearing - wall.bearing_rad).unsqueeze(-1)
         heading = p[:, 3].clone()
         torch.baddbmm(p, gain.unsqueeze(-1), heading.unsqueeze(-2), alpha=-1.0, out=p)
-        self._apply(change)
+        self._learn(change)
         return change
 
-    def _apply(self, change: Tensor) -> None:
+    def _learn(self, change: Tensor) -> None:
         """Change the learnt errors and the remembered distances."""
         self.errors = self.errors + change[:, 2:OWN]
         at = self.active.clamp_min(0)

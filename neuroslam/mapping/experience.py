@@ -350,6 +350,19 @@ class ExperienceMap(Population):
         self._turn_offset(wrap_angle(turned))
         return s.largest_correction
 
+    def measure_links(self) -> None:
+        """Make the links say what the poses do."""
+        links, poses = self.links, self.poses
+        way = poses[links.target] - poses[links.source]
+        heading = poses[links.source, 2]
+        columns = links._replace(
+            distance_m=np.hypot(way[:, 0], way[:, 1]),
+            heading_rad=wrap_angles(np.arctan2(way[:, 1], way[:, 0]) - heading),
+            facing_rad=wrap_angles(way[:, 2]),
+        )
+        self.links_table.replace(**{k: torch.from_numpy(v) for k, v in columns._asdict().items()})
+        self._relaxation = None
+
     def neighbours(self, experience: int) -> list[int]:
         """Return the experiences one link away, in either direction, sorted.
 

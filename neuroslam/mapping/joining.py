@@ -8,6 +8,7 @@ import torch
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.tables import ALIAS_COLUMNS, Links, origin_key
 from neuroslam.population import Join, State, renamed
+from neuroslam.types import NO_TEMPLATE
 
 _PROVENANCE = ("first_frame", "session", "number")
 
@@ -34,7 +35,8 @@ def merge_maps(loaded: State, partial: State, join: Join) -> State:
     moved = {
         "pose": pose[kept],
         "cell": cell[kept],
-        "template": join.views[old["experiences.template"][kept]],
+        # A place without a view has -1, which finds the last entry: none again.
+        "template": np.append(join.views, NO_TEMPLATE)[old["experiences.template"][kept]],
         **{name: old[f"experiences.{name}"][kept] for name in _PROVENANCE},
     }
     merged = _append(loaded, "experiences", moved)
