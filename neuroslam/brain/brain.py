@@ -138,7 +138,8 @@ class NavigationBrain(nn.Module):
             action, experience = self.map.visit(place, self.navigation.pose, dt_s, frame.index)
         else:
             cells = self.pose_cells(motion, view)
-            action, experience = self.map(motion, view, cells, frame.index)
+            carried = where is not None and self.navigation.contradicts(view)
+            action, experience = self.map(motion, view, cells, frame.index, carried=carried)
             if where is not None:
                 self._correct(where, turn_rad)
                 self.navigation.see(view)

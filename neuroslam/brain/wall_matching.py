@@ -18,7 +18,8 @@ _LEAST_WALLS = 6
 _LEAST_SHARE = 0.6  # of the smaller memory's walls must find their like
 _CLEARLY = 0.85  # any other way to lay the maps may explain so many of those at most
 _BEARING_RAD = math.radians(15.0)
-_OFF_SIGMAS = 4.0  # of a wall's distance
+_OFF_SIGMAS = 2.5  # of a wall's distance: farther off is another wall
+_RMS_SIGMAS = 0.85  # by which all together may be off
 _LEAST_SPREAD = 0.08  # of normals: else the maps slide along parallel walls
 _TURNS = 12
 _CANDIDATES = 20_000
@@ -189,6 +190,8 @@ def match_walls(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[
     )
     if laid.n_same < needed:
         return None, f"at most {said}; {needed} must"
+    if laid.off_m > _RMS_SIGMAS * config.sigma_m:
+        return None, f"{said}; walls of one place would be by {_RMS_SIGMAS * config.sigma_m:.3f} m"
     if laid.spread < _LEAST_SPREAD:
         return None, f"{said}, but they are all parallel: the maps could slide along them"
     if laid.runner_up > _CLEARLY * laid.n_same:

@@ -1,6 +1,5 @@
 """Familiarity: what walls each place cell has felt, and whether those felt now contradict it."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -13,8 +12,9 @@ from neuroslam.population import Running
 _NEAR = 0.6  # share of the reach within which a wall cannot be overlooked
 _NEVER, _ALWAYS = 0.02, 0.98
 _SLACK_BINS = 2  # bearings may be off by so many boundary cells
+_OFTEN = 0.5
 _FAMILIAR_S = 1.0
-_FORGIVEN_S = 20.0
+_FORGIVES = 0.5  # what agrees counts less than what contradicts
 
 
 class Felt(NamedTuple):
@@ -50,8 +50,9 @@ class Familiarity(Running):
     r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
 
     A wall is near where none ever was, or none is felt where one always was: while that lasts,
-    ``doubt_s`` grows by the time, and it fades within 20 s. An animal is ``lost`` when it exceeds
-    ``lost_after_s``, until it has faded to half of that. State: seconds of each place cell with
+    ``doubt_s`` grows by the time. It shrinks, half as fast, while a wall is felt where one often
+    was; where nothing is felt or known it stays. An animal is ``lost`` when it exceeds
+    ``lost_after_s``, until it has shrunk to half of that. State: seconds of each place cell with
     each boundary cell (``felt_s``) and in all (``time_s``); the doubt.
 
     Args:
@@ -104,9 +105,11 @@ class Familiarity(Running):
         ever, always = share.unbind(1)
         new = (felt.near * ((ever @ self.slack) < _NEVER)).amax(-1)
         missing = ((always > _ALWAYS) * ((felt.any @ self.slack) == 0)).amax(-1)
-        surprise = torch.maximum(new, missing) * (time > _FAMILIAR_S) * (winner >= 0)
-        fades = math.exp(-dt_s / _FORGIVEN_S)
-        self.doubt_s = self.doubt_s * fades + dt_s * surprise
+        known = (time > _FAMILIAR_S) * (winner >= 0)
+        surprise = torch.maximum(new, missing) * known
+        agrees = (felt.near * ((ever @ self.slack) > _OFTEN)).amax(-1) * known * (surprise == 0)
+        doubt = self.doubt_s + dt_s * (surprise - _FORGIVES * agrees)
+        self.doubt_s = doubt.clamp(0.0, 2.0 * self.lost_after_s)
         self.lost = torch.where(
             self.lost,
             self.doubt_s > 0.5 * self.lost_after_s,

@@ -193,6 +193,18 @@ class NavigationCells(Population):
         x, y = self.oscillators.position_m.tolist()
         return Pose(x, y, wrap_angle(self.now.heading_rad - self.heading_error_rad))
 
+    def contradicts(self, view: ViewMatch) -> bool:
+        """Say whether a known view was learnt where the animal cannot be, as it believes."""
+        if view.is_new or view.template == NO_TEMPLATE or not self.seen["sure"][view.template]:
+            return False
+        x, y = self.seen["x_m"][view.template].item(), self.seen["y_m"][view.template].item()
+        here = self.pose
+        return math.hypot(x - here.x_m, y - here.y_m) > self._view_reach_m
+
+    @property
+    def _view_reach_m(self) -> float:
+        return 3.0 * self.config.wall_memory.view_sigma_m
+
     def see(self, view: ViewMatch) -> bool:
         """Learn where a new view is, or be corrected by where a known one was learnt.
 
@@ -217,13 +229,13 @@ class NavigationCells(Population):
             return False
         x, y, heading = (self.seen[c][view.template].item() for c in ("x_m", "y_m", "heading_rad"))
         off_x, off_y, sigma = x - here.x_m, y - here.y_m, self.config.wall_memory.view_sigma_m
-        if math.hypot(off_x, off_y) <= 3.0 * sigma:
+        if math.hypot(off_x, off_y) <= self._view_reach_m:
             now.views_agree = 0
             target = self.oscillators.position_m.new_tensor([x, y])
             step = self.walls.observe_position(self.oscillators.position_m, target, sigma)
             self.oscillators.shift(step)
             return False
-        again = math.hypot(off_x - now.off_x_m, off_y - now.off_y_m) <= 3.0 * sigma
+        again = math.hypot(off_x - now.off_x_m, off_y - now.off_y_m) <= self._view_reach_m
         now.views_agree = now.views_agree + 1 if again else 1
         now.off_x_m, now.off_y_m = off_x, off_y
         needed = self.config.sessions.confirm

@@ -124,24 +124,33 @@ class VelocityOscillators(Running):
         start[..., 0] = 1.0
         self.register_buffer("phases", start)
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
-        self._waves: tuple[int, Tensor, Tensor] | None = None
+        self._waves: tuple[int, Tensor, Tensor] | None = None  # follow from the spacings
+        self.register_load_state_dict_post_hook(lambda module, _: module._forget_waves())
 
     @property
     def waves(self) -> Tensor:
         """Wave vectors in rad/m, ``(n_modules, directions, 2)``; they follow from the spacings."""
         return wave_vectors(self.spacing_m, self.orientation_rad, self.config.directions)
 
+    def _forget_waves(self) -> None:
+        self._waves = None
+
     def _kept_waves(self) -> tuple[Tensor, Tensor]:
         if torch.is_grad_enabled() and self.spacing_m.requires_grad:
             return self.waves, torch.linalg.pinv(self.waves.flatten(0, 1))
-        version = self.spacing_m._version
-        kept = self._waves
-        if kept is None or kept[0] != version or kept[1].device != self.spacing_m.device:
+        spacing = self.spacing_m
+        version = -1 if spacing.is_inference() else spacing._version
+        if self._waves is None or self._waves[0] != version:
             with torch.inference_mode(mode=False), torch.no_grad():
-                waves = self.waves
-                kept = version, waves, torch.linalg.pinv(waves.flatten(0, 1))
-            self._waves = kept
-        return kept[1:]
+                waves = wave_vectors(
+                    spacing.detach().clone(), self.orientation_rad.clone(), self.config.directions
+                )
+                self._waves = version, waves, torch.linalg.pinv(waves.flatten(0, 1))
+        return self._waves[1:]
+
+    def _apply(self, fn: object, recurse: bool = True) -> "VelocityOscillators":
+        self._waves = None
+        return super()._apply(fn, recurse)
 
     def forward(self, velocity_m_s: Tensor, dt_s: float | Tensor) -> Tensor:
         """Move with a velocity in the world, ``([batch,] 2)``, and return the phases."""

@@ -174,9 +174,23 @@ class ExperienceMap(Population):
         )
 
     def forward(
-        self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int
+        self,
+        motion: Motion,
+        view: ViewMatch,
+        cells: PoseEstimate,
+        frame: int,
+        *,
+        carried: bool = False,
     ) -> tuple[Action, int]:
-        """Take in one frame; returns what was done and the experience the robot is at."""
+        """Take in one frame; returns what was done and the experience the robot is at.
+
+        Args:
+            motion: Since the last frame.
+            view: What was recognised.
+            cells: Pose-cell estimate.
+            frame: Its number.
+            carried: The robot did not drive to a place that it recognises: no link is made to it.
+        """
         self.move(motion)
         action: Action = "none"
         if view.template != NO_TEMPLATE:
@@ -195,6 +209,9 @@ class ExperienceMap(Population):
             if action == "create":
                 corrected = cells._replace(theta=(cells.theta - turned) % self.torus[2])
                 self.create(view.template, corrected, frame, view.relative_heading_rad)
+            elif action == "link" and carried:
+                action = "set"
+                self.set(found, view.relative_heading_rad)
             elif action == "link":
                 self.link(found, view.relative_heading_rad)
         self.relax()
