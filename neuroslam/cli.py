@@ -66,7 +66,7 @@ def run_command(
         typer.Argument(
             metavar="SOURCE",
             help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-            "or world:NAME.",
+            "VIDEO+MOTION.csv, arena:NAME or world:NAME.",
         ),
     ],
     out: Out,
@@ -374,6 +374,12 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         f"{figures['templates']} templates, {figures['experiences']} experiences, "
         f"{figures['links']} links, {figures['loop_closures']} loop closures"
     )
+    if "place_cells" in figures:
+        lost = figures["lost_s"]
+        console.print(
+            f"{figures['place_cells']} place cells, {figures['walls']} stretches of wall; "
+            + (f"lost for {lost:.0f} s: walls contradicted the map" if lost else "never lost")
+        )
     for report in summary.merges:
         _print_report(report)
     for report in summary.refusals[:3]:

@@ -68,6 +68,7 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
         ("view", f"{view.template_width} x {view.template_height} px, threshold {view.threshold}"),
+        ("cells", config.cells),
         ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
     ]
     origins = brain.map.origins()
@@ -91,6 +92,19 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
         ("experiences", str(brain.map.n)),
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
+        *_navigation_counts(brain),
+    ]
+
+
+def _navigation_counts(brain: NavigationBrain) -> list[tuple[str, str]]:
+    if brain.config.cells == "pose":
+        return []
+    cells = brain.navigation
+    return [
+        ("place cells", str(int(cells.place.n_cells))),
+        ("stretches of wall", str(int(cells.walls.n_walls))),
+        ("activated boundary cells", str(int(cells.familiarity.n_activated()))),
+        ("lost for", f"{cells.now.lost_s:.1f} s"),
     ]
 
 
@@ -111,9 +125,10 @@ def _session(session: Session, made: Counter[int], own: Counter[int]) -> str:
 def _merge(report: dict[str, Any]) -> tuple[str, str]:
     at = "" if report["at_frame"] is None else f" at frame {report['at_frame']}"
     shift = ", ".join(f"{cells:.2f}" for cells in report["cell_shift"])
+    cells = "" if report["match"]["error"] is None else f"pose cells moved by {shift}, "
     return f"merge{at}", (
         f"session {report['partial_sessions'][-1]} into {', '.join(report['loaded_sessions'])}, "
-        f"{report['match']['places']} places agree, pose cells moved by {shift}, "
+        f"{report['match']['places']} places agree, {cells}"
         f"map turned by {math.degrees(report['rotation_rad']):.1f} degrees"
     )
 
@@ -211,7 +226,8 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         ("map.goals.experience", n, "experiences"),
         ("map.aliases.experience", n, "experiences"),
     ):
-        rows = np.flatnonzero((s[name] < 0) | (s[name] >= limit))
+        lowest = -1 if config.cells == "place" and name.endswith("template") else 0
+        rows = np.flatnonzero((s[name] < lowest) | (s[name] >= limit))
         if len(rows):
             yield f"{_row(name, rows)}: {name.split('.')[-1]} {_some(s[name][rows])}, " + (
                 f"there are {limit} {what}"
@@ -224,6 +240,8 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
             yield f"{name}: is {s[name]}, expected {lowest} to {limit - 1}"
     yield from _link_faults(s, n)
     yield from _cell_faults(state, config)
+    if config.cells != "pose":
+        yield from _navigation_faults(s, n if config.cells == "place" else None)
     yield from _origin_faults(s, n)
 
 
@@ -246,6 +264,29 @@ def _link_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
             f"the map falls into {parts} parts, of {_some(sizes)} experiences; "
             f"they begin at {_some(np.sort(first))}"
         )
+
+
+def _navigation_faults(s: dict[str, np.ndarray], n_experiences: int | None) -> Iterator[str]:
+    n_cells, n_walls = (
+        int(s[f"navigation.{name}"][0]) for name in ("place.n_cells", "walls.n_walls")
+    )
+    if n_experiences not in (None, n_cells):
+        yield f"{n_cells} place cells, {n_experiences} experiences; each should be the other"
+    linked = s["navigation.place.neighbours"][0, :n_cells]
+    rows = np.unique(np.nonzero((linked < -1) | (linked >= n_cells))[0])
+    if len(rows):
+        yield f"place cells {_some(rows)}: linked to cells that are not there; there are {n_cells}"
+    norms = np.linalg.norm(s["navigation.place.weights"][0, :n_cells], axis=1)
+    rows = np.flatnonzero(np.abs(norms - 1.0) > 1e-3)
+    if len(rows):
+        yield f"place cells {_some(rows)}: weights of norm {_some(norms[rows])}, expected 1"
+    active = s["navigation.walls.active"][0]
+    rows = np.flatnonzero((active < -1) | (active >= n_walls))
+    if len(rows):
+        yield f"active walls {_some(rows)}: not remembered; there are {n_walls}"
+    covariance = s["navigation.walls.covariance"][0]
+    if (np.diag(covariance) < 0).any():
+        yield "navigation.walls.covariance: a variance is negative"
 
 
 def _cell_faults(state: State, config: BrainConfig) -> Iterator[str]:

@@ -46,6 +46,7 @@ def join_brains(
     if found.match is None:
         return None, [_refusal(found.reason, loaded, partial)]
     merged, report = merge(loaded, partial, found.match)
+    report.found = found.reason
     reports = [report]
     if merged is None:
         return None, reports

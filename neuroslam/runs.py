@@ -47,6 +47,7 @@ from neuroslam.run_files import (
     write_text,
 )
 from neuroslam.sensors import Source, open_source
+from neuroslam.sensors.open import absolute_spec
 from neuroslam.types import Frame, StepResult
 
 
@@ -59,7 +60,7 @@ class RunSummary:
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
     interrupted: bool = False
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, float] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
     merges: list[dict[str, Any]] = field(default_factory=list)
     refusals: list[dict[str, Any]] = field(default_factory=list)
@@ -356,6 +357,14 @@ def write_results(
         "links": brain.map.n_links,
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
+    if brain.config.cells != "pose":
+        cells = brain.navigation
+        summary.counts |= {
+            "place_cells": int(cells.place.n_cells),
+            "walls": int(cells.walls.n_walls),
+            "activated_boundary_cells": int(cells.familiarity.n_activated()),
+            "lost_s": round(cells.now.lost_s, 3),
+        }
     if truth is not None:
         # A robot that has not moved: nothing tells how to lay its track over the truth.
         with contextlib.suppress(MapError):
@@ -385,13 +394,13 @@ def _absolute(source: str | Path) -> str:
         text.encode()
     except UnicodeEncodeError:
         raise SourceError(f"{text!a}: its name is not UTF-8; rename it") from None
-    return text if text.startswith("world:") else str(Path(text).resolve())
+    return absolute_spec(text)
 
 
 def recorded(source: str) -> str:
     """Return the day on which a recording's file was written, or nothing where there is none."""
     path = Path(source)
-    if source.startswith("world:") or not path.exists():
+    if not path.exists():  # made on the fly, or of two recordings
         return ""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()
 

@@ -258,5 +258,5 @@ class WallMemoryConfig(Section):
         0.3, gt=0, description="how far from where a view was learnt it may be recognised"
     )
     lost_after_s: float = Field(
-        2.0, gt=0, description="walls contradict the memory for so long: the animal is lost"
+        3.0, gt=0, description="walls contradict the memory for so long: the animal is lost"
     )

@@ -131,7 +131,7 @@ class NavigationBrain(nn.Module):
         self.continuity.moved(velocity, dt_s)
         view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
-            self._name_session(frame)
+            self._name_session(frame, felt)
         if self.config.cells == "place":
             cells = PoseEstimate(*self.navigation.oscillators.position_m.tolist(), 0.0)
             place = NO_EXPERIENCE if where.lost else int(where.place)
@@ -269,7 +269,7 @@ class NavigationBrain(nn.Module):
         while tally.n < len(stored):
             tally.append(alike=0, agreed=0)
 
-    def _name_session(self, frame: Frame) -> None:
+    def _name_session(self, frame: Frame, felt: np.ndarray | None = None) -> None:
         """Open a session, or give the one that was announced its id, by what it begins with."""
         self._open(
             Session(
@@ -281,6 +281,7 @@ class NavigationBrain(nn.Module):
                     float(frame.time_s),
                     frame.image,
                     frame.velocity,
+                    *(() if self.config.cells == "pose" else (frame.heading_rad, felt)),
                 ),
                 *self.about,
                 frame.index,

@@ -79,6 +79,7 @@ class MergeReport:
         residual_before_m: RMS over all links of how far they are off, before.
         residual_after_m: The same after the merged map was relaxed, to see.
         largest_correction_m: How far that relaxation moved the place that it moved farthest.
+        found: How it was found that the maps meet, where that was looked for.
     """
 
     merged: bool
@@ -94,6 +95,7 @@ class MergeReport:
     residual_before_m: float | None = None
     residual_after_m: float | None = None
     largest_correction_m: float | None = None
+    found: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values, for ``metrics.json``."""
@@ -109,9 +111,13 @@ class MergeReport:
                 f"{m['loaded_experience']} (frame {m['loaded_frame']}), "
                 f"{m['places']} places agree"
             )
+        if self.found:
+            lines.append(f"found: {self.found}")
+        by_views = self.match and self.match["error"] is not None
+        if by_views:
             runner_up = "none" if m["runner_up"] is None else f"{m['runner_up']:.4f}"
             lines.append(f"likeness: view difference {m['error']:.4f}, best elsewhere {runner_up}")
-        if self.cell_shift:
+        if self.cell_shift and by_views:
             x, y, theta = self.cell_shift
             lines.append(f"pose cells moved by {x:.2f}, {y:.2f}, {theta:.2f} cells (x, y, theta)")
         if self.rotation_rad is not None:
@@ -409,7 +415,7 @@ def _describe(
     report.match = {
         **place(loaded, "loaded", match.loaded),
         **place(partial, "partial", match.partial),
-        "error": float(match.error),
+        "error": None if merged.config.cells == "place" else float(match.error),
         "runner_up": None if match.runner_up is None else float(match.runner_up),
         "relative_heading_rad": float(match.turn_rad),
         "places": len(match.pairs.partial),
@@ -431,6 +437,14 @@ def _describe(
             ("links", lambda brain: brain.map.n_links),
         )
     }
+    if merged.config.cells != "pose":
+        report.counts |= {
+            what: {"loaded": count(loaded), "partial": count(partial), "merged": count(merged)}
+            for what, count in (
+                ("place cells", lambda brain: int(brain.navigation.place.n_cells)),
+                ("walls", lambda brain: int(brain.navigation.walls.n_walls)),
+            )
+        }
 
 
 def _strain(

@@ -9,10 +9,11 @@ from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
 from neuroslam.population import Running
 
-_NEAR = 0.6  # share of the reach within which a wall cannot be overlooked
+SURE = 0.6
+"""Share of the reach within which a wall cannot be overlooked."""
+
 _NEVER, _ALWAYS = 0.02, 0.98
 _SLACK_BINS = 2  # bearings may be off by so many boundary cells
-_OFTEN = 0.5
 _FAMILIAR_S = 1.0
 _FORGIVES = 0.5  # what agrees counts less than what contradicts
 
@@ -42,17 +43,18 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
     none = distance_m.new_zeros(len(distance_m), n_bearings)
     return Felt(
         none.scatter_reduce(1, bins, (distance_m < reach_m).to(none), "amax"),
-        none.scatter_reduce(1, bins, (distance_m < _NEAR * reach_m).to(none), "amax"),
+        none.scatter_reduce(1, bins, (distance_m < SURE * reach_m).to(none), "amax"),
     )
 
 
 class Familiarity(Running):
     r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
 
-    A wall is near where none ever was, or none is felt where one always was: while that lasts,
-    ``doubt_s`` grows by the time. It shrinks, half as fast, while a wall is felt where one often
-    was; where nothing is felt or known it stays. An animal is ``lost`` when it exceeds
-    ``lost_after_s``, until it has shrunk to half of that. State: seconds of each place cell with
+    A wall is near where none ever was, or none is felt where one always was, or one is not where
+    it was remembered: while that lasts, ``doubt_s`` grows by the time. It shrinks, half as fast,
+    while a wall that was long known is where it should be; where nothing is felt or known it stays.
+    An animal is ``lost`` when it exceeds ``lost_after_s``, until it has shrunk to half of that.
+    State: seconds of each place cell with
     each boundary cell (``felt_s``) and in all (``time_s``); the doubt.
 
     Args:
@@ -86,7 +88,12 @@ class Familiarity(Running):
 
     @torch.inference_mode()
     def forward(
-        self, winner: Tensor, distance_m: Tensor, bearing_rad: Tensor, dt_s: float
+        self,
+        winner: Tensor,
+        distance_m: Tensor,
+        bearing_rad: Tensor,
+        evidence: tuple[Tensor, Tensor],
+        dt_s: float,
     ) -> Tensor:
         """Compare the walls around with those known of the place; returns who is lost.
 
@@ -94,6 +101,8 @@ class Familiarity(Running):
             winner: Number of the place cell that won, ``(batch or 1,)``; -1 for none.
             distance_m: Distances to walls, ``(batch or 1, n_walls)``; ``inf`` for none.
             bearing_rad: Their bearings in the world, the same shape.
+            evidence: Against and for where the animal believes to be, as
+                :meth:`~neuroslam.cells.walls.WallMemory.evidence` has it.
             dt_s: Time since the last call.
         """
         self._make_room(int(winner.max()))
@@ -105,17 +114,18 @@ class Familiarity(Running):
         ever, always = share.unbind(1)
         new = (felt.near * ((ever @ self.slack) < _NEVER)).amax(-1)
         missing = ((always > _ALWAYS) * ((felt.any @ self.slack) == 0)).amax(-1)
-        known = (time > _FAMILIAR_S) * (winner >= 0)
-        surprise = torch.maximum(new, missing) * known
-        agrees = (felt.near * ((ever @ self.slack) > _OFTEN)).amax(-1) * known * (surprise == 0)
-        doubt = self.doubt_s + dt_s * (surprise - _FORGIVES * agrees)
+        known = (time > _FAMILIAR_S) & (winner >= 0)
+        against, speaks_for = evidence
+        surprise = against | ((torch.maximum(new, missing) > 0) & known)
+        agrees = speaks_for & ~surprise
+        doubt = self.doubt_s + dt_s * (surprise.to(time) - _FORGIVES * agrees.to(time))
         self.doubt_s = doubt.clamp(0.0, 2.0 * self.lost_after_s)
         self.lost = torch.where(
             self.lost,
             self.doubt_s > 0.5 * self.lost_after_s,
             self.doubt_s > self.lost_after_s,
         )
-        sure = ((surprise == 0) & (winner >= 0) & ~self.lost).to(time) * dt_s
+        sure = (~surprise & (winner >= 0) & ~self.lost).to(time) * dt_s
         self.time_s[rows, cell] = time + sure
         self.felt_s[rows, cell] += torch.stack(felt, dim=1) * sure[:, None, None]
         return self.lost

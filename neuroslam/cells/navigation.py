@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.cells.boundary import BoundaryCells, check_walls
-from neuroslam.cells.familiarity import Familiarity
+from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.joining import join_navigation
 from neuroslam.cells.oscillators import VelocityOscillators
@@ -79,6 +79,7 @@ class NavigationCells(Population):
         self.now = Scalars(
             since_s=0.0,
             someone_lost=0,
+            lost_s=0.0,  # animals times seconds
             heading_rad=math.radians(config.map.initial_heading_deg),
             compass=0,
             turned_rad=0.0,  # of the compass, since the map was turned in a merge
@@ -92,6 +93,7 @@ class NavigationCells(Population):
             {name: ((), torch.float64) for name in ("x_m", "y_m", "heading_rad", "sure")}
         )
 
+    @torch.inference_mode()
     def forward(
         self,
         speed_m_s: Tensor,
@@ -139,10 +141,13 @@ class NavigationCells(Population):
         place = self.place(grid.flatten(-2), oscillators.position_m, dt_s, learns=learns)
         now.since_s += dt_s
         if now.since_s >= FAMILIARITY_PERIOD_S:
-            felt = (wall_m, bearing) if self.batch is not None else (wall_m[None], bearing[None])
-            lost = self.familiarity(
-                self.place.winner, felt[0], felt[1] - memory.errors[:, 1:], now.since_s
-            )
+            x, felt_m, felt_rad = oscillators.position_m, wall_m, bearing - memory.errors[:, 1:]
+            if self.batch is None:
+                x, felt_m, felt_rad = x[None], felt_m[None], felt_rad.reshape(1, -1)
+            sure_m = SURE * self.config.boundary_cells.reach_m
+            evidence = memory.evidence(x, felt_m, felt_rad, sure_m)
+            lost = self.familiarity(self.place.winner, felt_m, felt_rad, evidence, now.since_s)
+            now.lost_s += now.since_s * int(lost.sum())
             now.since_s, now.someone_lost = 0.0, int(lost.any())
         return Whereabouts(
             oscillators.position_m,
@@ -215,6 +220,8 @@ class NavigationCells(Population):
             Whether it did.
         """
         now = self.now
+        if view.template == NO_TEMPLATE:  # no picture at this instant: the last view still counts
+            return False
         here = self.pose
         if view.is_new:
             self.seen.append(
@@ -223,7 +230,7 @@ class NavigationCells(Population):
                 heading_rad=here.theta_rad - view.relative_heading_rad,
                 sure=float(not now.someone_lost),
             )
-        known = view.template not in (NO_TEMPLATE, now.last_view) and not view.is_new
+        known = view.template != now.last_view and not view.is_new
         now.last_view = view.template
         if not known or not self.seen["sure"][view.template]:
             return False

@@ -26,17 +26,27 @@ OWN = 4
 ACTIVE = 96
 """Walls, the nearest ones, whose errors are known to go together; more are kept besides."""
 
+SAMPLE_S = 0.05
+"""Time for which an error of speed or heading lasts; its effect does not depend on the rate."""
+
+_OLD_S = 60.0  # memories at least so old say whether an animal knows its way
+_ABREAST = 0.2  # of a stretch of wall: so near to where it was met that it must be there still
+_ALIKE_RAD = math.radians(25.0)
 _UNKNOWN_M2 = 1.0  # variance of a distance before it was measured
 
 
 class Wall(NamedTuple):
-    """Columns of the memory: anchor, bearing and distance of a wall from there, its variance."""
+    """Columns of the memory: anchor, bearing and distance of a wall from there, its variance.
+
+    And since when it is remembered, on the animal's clock.
+    """
 
     x_m: Tensor
     y_m: Tensor
     bearing_rad: Tensor
     distance_m: Tensor
     variance_m2: Tensor
+    made_s: Tensor
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -119,6 +129,8 @@ class WallMemory(Running):
     moved_m: Tensor
     squares_m2: Tensor
     scale: Tensor
+    rejected: Tensor
+    accepted: Tensor
 
     def __init__(self, config: WallMemoryConfig, batch: int | None = None) -> None:
         super().__init__()
@@ -134,7 +146,9 @@ class WallMemory(Running):
         self.register_buffer("squares_m2", torch.zeros(b, **kind))
         scale = torch.tensor([config.spread_m, math.radians(config.spread_deg)], **kind)
         self.register_buffer("scale", scale)  # within which a wall is one: m, rad
-        self.since = Scalars(s=0.0, squares_s2=0.0)
+        self.register_buffer("rejected", torch.zeros(b, dtype=torch.bool))
+        self.register_buffer("accepted", torch.zeros(b, dtype=torch.bool))
+        self.since = Scalars(s=0.0, time_s=0.0)
         variances = [0.0, 0.0, config.speed_scale**2, math.radians(config.heading_slow_deg) ** 2]
         self.covariance[:] = torch.diag(torch.tensor(variances, **kind))
         self.register_load_state_dict_pre_hook(_take_sizes)
@@ -170,9 +184,10 @@ class WallMemory(Running):
         length = speed_m_s * (dt_s - dt_s * scale)
         step = torch.view_as_real(torch.polar(length, heading_rad - compass))
         self.moved_m = self.moved_m + step
-        self.squares_m2 = self.squares_m2 + length * length
+        if dt_s > 0.0:
+            self.squares_m2 = self.squares_m2 + length * length * (SAMPLE_S / dt_s)
         self.since.s += dt_s
-        self.since.squares_s2 += dt_s * dt_s
+        self.since.time_s += dt_s
         return step if self.batch is not None else step[0]
 
     @torch.inference_mode()
@@ -222,6 +237,43 @@ class WallMemory(Running):
         return correction[0] if one else correction
 
     @torch.inference_mode()
+    def evidence(
+        self, position_m: Tensor, distance_m: Tensor, bearing_rad: Tensor, sure_m: float
+    ) -> tuple[Tensor, Tensor]:
+        """Say whether what is felt speaks against where the animal believes to be, or for it.
+
+        Against: a known wall was not where it should be since the last call, or one is not felt
+        that must be near. For: a wall that was long known was where it should be.
+
+        Args:
+            position_m: Where the animals believe to be, ``(batch or 1, 2)``.
+            distance_m: Distances to walls, ``(batch or 1, n_walls)``; ``inf`` for none.
+            bearing_rad: Their bearings in the world, the same shape.
+            sure_m: A nearer wall cannot be overlooked.
+
+        Returns:
+            Two truths for each animal, ``(batch or 1,)``.
+        """
+        against, speaks_for = self.rejected, self.accepted
+        if self.active.shape[1]:
+            at = self.active.clamp_min(0).unsqueeze(-1).expand(-1, -1, self.walls.shape[-1])
+            wall = Wall(*self.walls.gather(1, at).unbind(-1))
+            dx, dy = wall.x_m - position_m[:, :1], wall.y_m - position_m[:, 1:]
+            nx, ny = wall.bearing_rad.cos(), wall.bearing_rad.sin()
+            expected = wall.distance_m + dx * nx + dy * ny
+            abreast = (dy * nx - dx * ny).abs() < _ABREAST * self.scale[0]
+            old = self.since.time_s - wall.made_s > _OLD_S
+            due = abreast & old & (self.active >= 0) & (expected > 0) & (expected < sure_m)
+            slack = 0.5 * sure_m
+            alike = (wrap(bearing_rad.unsqueeze(1) - wall.bearing_rad.unsqueeze(2)).abs()
+                     < _ALIKE_RAD)  # fmt: skip
+            near = (distance_m.unsqueeze(1) - expected.unsqueeze(2)).abs() < slack
+            against = against | (due & ~(alike & near).any(-1)).any(-1)
+        self.rejected = torch.zeros_like(self.rejected)
+        self.accepted = torch.zeros_like(self.accepted)
+        return against, speaks_for & ~against
+
+    @torch.inference_mode()
     def observe_position(self, position_m: Tensor, seen_at_m: Tensor, sigma_m: float) -> Tensor:
         """Take in a position that something else tells, as a view does.
 
@@ -258,7 +310,7 @@ class WallMemory(Running):
         """Forget the motion since the last look."""
         self.moved_m = torch.zeros_like(self.moved_m)
         self.squares_m2 = torch.zeros_like(self.squares_m2)
-        self.since.s = self.since.squares_s2 = 0.0
+        self.since.s = 0.0
 
     def _predict(self, compass: bool) -> None:
         r"""Let the belief spread by the motion since the last look.
@@ -280,7 +332,7 @@ class WallMemory(Running):
         p[:, :2, :] += lever @ p[:, 2:4, :]
         p[:, :, :2] += p[:, :, 2:4] @ lever.mT
         share = 0.5 * (c.speed_factor**2 + math.radians(c.heading_white_deg) ** 2)
-        spread = share * self.squares_m2 + 0.5 * c.speed_add_m_s**2 * self.since.squares_s2
+        spread = share * self.squares_m2 + 0.5 * c.speed_add_m_s**2 * SAMPLE_S * dt_s
         p[:, 0, 0] += spread
         p[:, 1, 1] += spread
         stays = math.exp(-dt_s / c.heading_slow_s)
@@ -326,7 +378,11 @@ class WallMemory(Running):
             moves[rows, OWN + slot] - normal[:, 0] * moves[:, 0] - normal[:, 1] * moves[:, 1]
             - half * moves[:, 3] + c.sigma_m**2 + (half * math.radians(c.sigma_deg)).square()
         )  # fmt: skip
-        use = use & (off.square() < c.gate**2 * variance)
+        fits = off.square() < c.gate**2 * variance
+        old = self.since.time_s - wall.made_s > _OLD_S
+        self.rejected = self.rejected | (use & ~fits)
+        self.accepted = self.accepted | (use & fits & old)
+        use = use & fits
         gain = (moves / variance.unsqueeze(-1)).where(use.unsqueeze(-1), 0.0)
         change = gain * off.unsqueeze(-1)
         torch.baddbmm(p, gain.unsqueeze(-1), moves.unsqueeze(-2), alpha=-1.0, out=p)
@@ -397,8 +453,9 @@ class WallMemory(Running):
                 if learns is not None and not learns[row]:
                     continue
                 wall = n
-                self._remember(row, torch.stack([*position[row], bearing[row], distance[row],
-                                                 position.new_tensor(_UNKNOWN_M2)]))  # fmt: skip
+                new = [*position[row], bearing[row], distance[row]]
+                rest = position.new_tensor([_UNKNOWN_M2, self.since.time_s])
+                self._remember(row, torch.cat([torch.stack(new), rest]))
             slot[row], known[row] = self._activate(row, wall, position[row]), True
         return slot, known
 
