@@ -5,7 +5,7 @@ Blue is the map that walls correct, black dashes the truth; :mod:`neuroslam.draw
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -33,6 +33,8 @@ from neuroslam.evaluation.trajectory import path_length
 from neuroslam.sensors.arena import Arena
 
 _ABOVE = 0.5  # share of the strongest response, above which a cell counts as responding
+_MARK = {"color": INK, "lw": 1.2, "ls": ":", "zorder": 4}
+_PANEL_IN = 3.4  # width of an arena
 _SHARED = {"ls": (0, (4, 3)), "color": TRUTH, "lw": 0.9}
 
 
@@ -109,8 +111,7 @@ def plot_place_maps(
         for axes, one in zip(panels, (one for row in maps for one in row), strict=True):
             axes.plot(*truth_m.T, color="#dddddd", lw=0.4, zorder=1)
             _draw_places(axes, one.centres_m, one.links)
-            counts = (counted(len(one.centres_m), "place"), counted(len(one.links), "link"))
-            write_title(axes, one.name, " · ".join(counts))
+            write_title(axes, one.name, counted(len(one.centres_m), "place"))
         key = [
             Line2D([], [], color=MAP, marker="o", ms=3.5, lw=0.8, label="places, links"),
             Line2D([], [], color="#cccccc", lw=1.2, label="true path"),
@@ -149,7 +150,7 @@ def plot_paths(
         for axes, one in zip(panels, told, strict=True):
             colour = colour_of(one.name)
             axes.plot(*one.path_m.T, color=colour, lw=0.7, alpha=0.9, zorder=2)
-            axes.plot(*truth_m.T, zorder=3, **{**_SHARED, "lw": 0.6})
+            axes.plot(*truth_m.T, zorder=3, **_SHARED)
             error = np.linalg.norm(one.path_m - truth_m, axis=1).mean()
             said = f"mean error {100 * error:.1f} cm"
             if one.walls_m is not None:
@@ -179,7 +180,7 @@ def plot_responses(responses: Sequence[Response], arena: Arena, title: str | Non
         raise ValueError("plot_responses: expected at least one response")
     boxes = [one.centres_m for one in responses]
     with mpl.rc_context(STYLE):
-        figure, panels = _panels(arena, boxes, 1, len(responses), title)
+        figure, panels = _panels(arena, boxes, 1, len(responses), title, aside_in=1.0)
         for axes, one in zip(panels, responses, strict=True):
             share = one.rates / max(float(one.rates.max()), 1e-30)
             order = share.argsort()  # the strong ones on top
@@ -191,7 +192,7 @@ def plot_responses(responses: Sequence[Response], arena: Arena, title: str | Non
             axes.scatter(*strong.T, s=90, facecolors="none", edgecolors=LOOP, lw=1.6, zorder=5)
             axes.plot(*one.position_m, marker="x", ms=8, mew=2, color=INK, ls="none", zorder=6)
             write_title(axes, one.name, f"{counted(len(strong), 'cell')} above half")
-        figure.colorbar(picture, ax=panels, shrink=0.75, label="share of the strongest response")
+        figure.colorbar(picture, ax=panels, shrink=0.9, label="share of the strongest response")
         key = [
             Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=LOOP, mew=1.6,
                    label="above half of the strongest"),
@@ -230,20 +231,17 @@ def plot_growth(
                 draw_band(axes, spread.minutes, scale * spread.values, name)
             axes.set(xlabel="time (min)")
             axes.set_ylim(bottom=0)
-            axes.margins(x=0.01)
-        for name, mark in (marks_m or {}).items():
-            right.axhline(100.0 * mark, color=INK, lw=1.0, ls=":")
-            right.annotate(
-                f"{name}: {100 * mark:.1f} cm", (0.0, 100.0 * mark), (3, 2), fontsize=8, va="bottom",
-                xycoords=right.get_yaxis_transform(), textcoords="offset points",
-            )  # fmt: skip
+            axes.set_xlim(0, max(float(spread.minutes[-1]) for spread in cells.values()))
+        for mark in (marks_m or {}).values():
+            right.axhline(100.0 * mark, **_MARK)
         left.set(ylabel="cells")
         right.set(ylabel="error of position (cm)")
         n = len(next(iter(cells.values())).values)
         write_title(left, "Places recruited", f"mean and sd of {counted(n, 'seed')}")
-        write_title(right, "Error over time", "mean of each minute, not aligned")
+        write_title(right, "Error over time", "mean and sd, not aligned")
         names = list(dict.fromkeys([*cells, *errors_m]))
-        key = [Line2D([], [], color=colour_of(name), lw=1.8, label=name) for name in names]
+        key = [Line2D([], [], label=name, **_line(name)) for name in names]
+        key += _marks(marks_m)
         figure.legend(handles=key, loc="outside lower center", ncols=len(key))
     return figure
 
@@ -268,7 +266,7 @@ def plot_errors(
     tracks = list(dict.fromkeys(track for values in errors_m.values() for track in values))
     wide = 0.8 / len(errors_m)
     with mpl.rc_context(STYLE):
-        figure = new_figure(max(6.0, 1.8 * len(tracks) + 1.5), 4.2, title)
+        figure = new_figure(max(7.0, 1.8 * len(tracks) + 1.5), 4.2, title)
         axes = figure.subplots()
         for number, (method, values) in enumerate(errors_m.items()):
             at = [tracks.index(track) + (number + 0.5) * wide - 0.4 for track in values]
@@ -276,14 +274,15 @@ def plot_errors(
             sd = [100.0 * np.std(seeds) for seeds in values.values()]
             look = {"ecolor": INK, "error_kw": {"lw": 1.0}, "capsize": 2, "zorder": 3}
             axes.bar(at, mean, 0.92 * wide, yerr=sd, color=colour_of(method), label=method, **look)
-        for name, mark in (marks_m or {}).items():
-            label = f"{name}: {100 * mark:.1f} cm"
-            axes.axhline(100.0 * mark, color=INK, lw=1.0, ls=":", label=label, zorder=4)
+        for mark in (marks_m or {}).values():
+            axes.axhline(100.0 * mark, **_MARK)
         axes.set_xticks(range(len(tracks)), tracks)
         axes.grid(visible=False, axis="x")
         axes.set(ylabel="mean error of position (cm)")
         write_title(axes, "Not aligned", "bars: mean over seeds; whiskers: sd")
-        figure.legend(loc="outside lower center", ncols=3)
+        key = [Patch(color=colour_of(method), label=method) for method in errors_m]
+        key += _marks(marks_m)
+        figure.legend(handles=key, loc="outside lower center", ncols=len(key))
     return figure
 
 
@@ -362,9 +361,22 @@ def colour_of(name: str) -> str:
 
 def draw_band(axes: Axes, at: np.ndarray, values: np.ndarray, name: str) -> None:
     """Draw the mean of ``(repetitions, n)`` as a line, and one standard deviation as a band."""
-    mean, sd, colour = values.mean(axis=0), values.std(axis=0), colour_of(name)
-    axes.fill_between(at, mean - sd, mean + sd, color=colour, alpha=0.18, lw=0, zorder=2)
-    axes.plot(at, mean, color=colour, lw=1.8, label=name, zorder=3)
+    mean, sd = values.mean(axis=0), values.std(axis=0)
+    axes.fill_between(at, mean - sd, mean + sd, color=colour_of(name), alpha=0.15, lw=0, zorder=2)
+    axes.plot(at, mean, label=name, zorder=3, **_line(name))
+
+
+def _line(name: str) -> dict[str, Any]:
+    """Say how a method's line looks: RatSLAM's, which hides another where it is alike, dashed."""
+    dash = (0, (4, 2)) if name.startswith("RatSLAM") else "-"
+    return {"color": colour_of(name), "lw": 1.8, "ls": dash}
+
+
+def _marks(marks_m: Mapping[str, float] | None) -> list[Line2D]:
+    return [
+        Line2D([], [], label=f"{name}: {100.0 * mark:.1f} cm", **_MARK)
+        for name, mark in (marks_m or {}).items()
+    ]
 
 
 def _draw_places(axes: Axes, centres: np.ndarray, links: np.ndarray) -> None:
@@ -375,7 +387,12 @@ def _draw_places(axes: Axes, centres: np.ndarray, links: np.ndarray) -> None:
 
 
 def _panels(
-    arena: Arena, points: Sequence[np.ndarray], rows: int, columns: int, title: str | None
+    arena: Arena,
+    points: Sequence[np.ndarray],
+    rows: int,
+    columns: int,
+    title: str | None,
+    aside_in: float = 0.0,
 ) -> tuple[Figure, list[Axes]]:
     """Make panels with the arena in them, all with the same axes, wide enough for all points."""
     x_min, x_max, y_min, y_max = arena.bounds
@@ -383,9 +400,9 @@ def _panels(
     low, high = everything.min(axis=0), everything.max(axis=0)
     pad = 0.04 * float((high - low).max())
     low, high = low - pad, high + pad
-    width = 3.7
-    tall = width * float((high - low)[1] / (high - low)[0])
-    figure = new_figure(columns * (width + 0.35), rows * (tall + 0.75) + 0.8, title)
+    tall = _PANEL_IN * float((high - low)[1] / (high - low)[0])
+    size = columns * (_PANEL_IN + 0.85) + aside_in, rows * (tall + 0.75) + 0.7
+    figure = new_figure(*size, title)
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes in panels:
         draw_arena(axes, arena)

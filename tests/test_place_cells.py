@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -130,7 +131,7 @@ def test_after_a_long_walk_there_are_more_cells_than_the_window_and_all_is_sound
     to_nearest = torch.cdist(walk, centres).min(1).values
     assert to_nearest.max() < CONFIG.threshold_m
     torch.testing.assert_close(cells.weights[0, :n].norm(dim=1), torch.ones(n))
-    changes = [pair for pair in zip(winners, winners[1:], strict=False) if pair[0] != pair[1]]
+    changes = [pair for pair in itertools.pairwise(winners) if pair[0] != pair[1]]
     assert {tuple(link) for link in links.tolist()} <= {(min(p), max(p)) for p in changes}
     assert cells.visits.sum().item() == len(changes) + 1
     assert cells.time_s.sum().item() + cells.now.stay_s == pytest.approx(0.5 * len(walk))

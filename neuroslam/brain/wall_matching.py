@@ -204,9 +204,8 @@ def match_walls(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[
 
 def outline_of(brain: "NavigationBrain") -> Outline:
     """Return the feet of the walls that a brain remembers."""
-    x, y, bearing, distance, _ = (
-        c.numpy(force=True) for c in brain.navigation.walls.remembered()[0]
-    )
+    walls = brain.navigation.walls.remembered()[0]
+    x, y, bearing, distance = (column.numpy(force=True) for column in walls[:4])
     feet = np.column_stack([x + distance * np.cos(bearing), y + distance * np.sin(bearing)])
     return Outline(feet, bearing)
 

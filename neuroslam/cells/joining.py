@@ -207,7 +207,8 @@ def _join_walls(loaded: State, partial: State, frames: Frames) -> State:
     """Put the loaded walls first; a partial one like one of them becomes it."""
     merged = {k: v for k, v in partial.items() if k.startswith("walls.")}
     n, m = (int(state["walls.n_walls"][0]) for state in (loaded, partial))
-    one, other = loaded["walls.walls"][0, :n], partial["walls.walls"][0, :m].clone()
+    one, other = loaded["walls.walls"][0, :n].clone(), partial["walls.walls"][0, :m].clone()
+    one[:, 5] -= loaded["walls.since.time_s"]  # before the session that goes on began
     other[:, :2] = frames.place(other[:, :2])
     other[:, 2] = wrap(other[:, 2] + frames.turn_rad)
     to = n + torch.arange(m)

@@ -1,0 +1,281 @@
+"""Lives of place cells on rats' tracks, by all methods that are compared, and what they told."""
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from neuroslam.cells.navigation import NavigationCells, Whereabouts
+from neuroslam.cells.pose import PoseCellNetwork
+from neuroslam.cells.walls import Wall
+from neuroslam.config import BrainConfig, PoseCellConfig
+from neuroslam.evaluation.ratemap import responding
+from neuroslam.experiments.animals import WALLS, Hook, path_integration, read_track
+from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.place_drawing import Spread
+from neuroslam.sensors.rodent import Walk
+from neuroslam.sensors.senses import SenseNoise, Senses, sense
+from neuroslam.types import Motion
+
+FULL, WEAK, EASY = "noise 1.0", "noise 0.3", "noise 1.0, bearings from the compass"
+"""Conditions: how the senses err."""
+
+SLRB, HEBB, RATSLAM, PATH = "SLRB", "competitive Hebb", "RatSLAM", "path integration"
+
+_COUNT_EVERY = 100  # steps between counts of place cells
+_LOOK_EVERY = 80  # steps between looks at all responses
+_POSE_CELL_M = 0.06  # as the place cells: counts of cells can be compared
+_POSE_STEPS = 4  # samples summed to one motion of the pose cells: five a second
+
+
+class Told(NamedTuple):
+    """What a method told of one track under one condition, for every seed.
+
+    Attributes:
+        track: Name of the track.
+        condition: How the senses erred.
+        method: Who told it.
+        truth_m: ``(n, 2)``.
+        minutes: When, ``(n,)``.
+        estimate_m: Positions integrated, ``(seeds, n, 2)``.
+        winner_m: Centres of the cells that won, the same shape; ``None`` if it has no cells.
+        cells: Number of cells over time; ``None`` if it has none.
+        more: What else is worth a line.
+    """
+
+    track: str
+    condition: str
+    method: str
+    truth_m: np.ndarray
+    minutes: np.ndarray
+    estimate_m: np.ndarray
+    winner_m: np.ndarray | None = None
+    cells: Spread | None = None
+    more: Mapping[str, float] = {}
+
+
+class Diary:
+    """Hook that writes down what place cells do in a batch of lives.
+
+    Args:
+        beside_wall: Who feels a wall, ``(batch, steps)``.
+        start_m: True start, which the cells do not know.
+        early: Step at which the map of the first animal is kept.
+    """
+
+    def __init__(self, beside_wall: np.ndarray, start_m: np.ndarray, early: int) -> None:
+        self.beside_wall, self.start_m, self.early = beside_wall, start_m, early
+        self.estimate = np.empty((*beside_wall.shape[::-1], 2))
+        self.winner = np.empty_like(self.estimate)
+        self.lost = np.empty(self.estimate.shape[:2], dtype=bool)
+        self.counted: list[np.ndarray] = []
+        self.count_steps: list[int] = []
+        self.maps: list[tuple[np.ndarray, np.ndarray]] = []
+        # Cells above half of the strongest, where a wall is felt; by the grid and the position, and
+        # by the grid alone: animal, count.
+        self.above: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+        self.looks: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def __call__(self, i: int, here: Whereabouts, cells: NavigationCells) -> None:
+        """Write down a step; a :data:`~neuroslam.experiments.animals.Hook`."""
+        self.estimate[i], self.lost[i] = here.position_m.numpy(), here.lost.numpy()
+        self.winner[i] = cells.place.centre_of(here.place).numpy()
+        last = i == len(self.estimate) - 1
+        if i % _COUNT_EVERY == 0 or last:
+            self.counted.append(cells.place.n_cells.numpy().copy())
+            self.count_steps.append(i)
+        if i == self.early or last:
+            centres, links = cells.place.graph()
+            self.maps.append((centres.numpy() + self.start_m, links.numpy()))
+        beside = np.flatnonzero(self.beside_wall[:, i])
+        if i % _LOOK_EVERY == 0 and len(beside):
+            self._look(i, here, cells, beside)
+
+    def _look(self, i: int, here: Whereabouts, cells: NavigationCells, beside: np.ndarray) -> None:
+        grid = cells.grid.rates.flatten(-2)
+        both = [cells.place.responses(grid, at).numpy() for at in (here.position_m, None)]
+        for above, rates in zip(self.above, both, strict=True):
+            above.append(np.column_stack([beside, responding(rates[beside])]))
+        if beside[0] == 0:  # the first animal's, to draw
+            n = int(cells.place.n_cells[0])
+            centres = cells.place.centres_m[0, :n].numpy() + self.start_m
+            self.looks[i] = centres, both[0][0, :n].copy(), both[1][0, :n].copy()
+
+    def single(self, rows: slice) -> dict[str, float]:
+        """Return how often exactly one cell responds beside a wall, and how many do."""
+        found = {}
+        for name, above in zip(("", "_by_grid_alone"), self.above, strict=True):
+            animal, n = np.concatenate([np.empty((0, 2), int), *above]).T
+            n = n[(animal >= rows.start) & (animal < rows.stop)]
+            found[f"one_cell_share{name}"] = float((n == 1).mean()) if len(n) else math.nan
+            found[f"cells_above_half{name}"] = float(n.mean()) if len(n) else math.nan
+        return found
+
+
+def stacked(senses: Sequence[Senses]) -> Senses:
+    """Put animals on one walk side by side, so that a step costs little more than one's.
+
+    Args:
+        senses: Of the same walk.
+    """
+    columns = ("speed_m_s", "heading_rad", "wall_m", "wall_bearing_rad")
+    return senses[0]._replace(
+        **{c: np.concatenate([getattr(s, c) for s in senses]) for c in columns}
+    )
+
+
+def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCells:
+    """Let navigation cells live through what was sensed; returns them as they are at the end."""
+    cells = NavigationCells(config, batch=len(senses.speed_m_s))
+    columns = [
+        torch.from_numpy(np.ascontiguousarray(np.moveaxis(column, 1, 0)))
+        for column in (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
+    ]
+    with torch.inference_mode():
+        for i, dt_s in enumerate(senses.dt_s.tolist()):
+            speed, heading, wall, bearing = (column[i] for column in columns)
+            hook(i, cells(speed, heading, dt_s, wall, bearing), cells)
+    return cells
+
+
+def pose_cells_alone(senses: Senses) -> tuple[np.ndarray, np.ndarray]:
+    """Let RatSLAM's pose cells integrate what was sensed, five times a second.
+
+    Four samples are summed to one motion, whose noise of heading is thereby averaged. No view
+    injects, so the torus may be small: the estimate is unwrapped, and nothing that passes a place a
+    lap away can change it.
+
+    Returns:
+        Steps at which they told something; x, y in cells and heading in cells, unwrapped, relative
+        to the start and turned so that x is east: ``(batch, n, 3)``.
+    """
+    batch, steps = senses.speed_m_s.shape
+    n = steps // _POSE_STEPS
+    length = senses.speed_m_s * senses.dt_s
+    moved = np.stack([length * np.cos(senses.heading_rad), length * np.sin(senses.heading_rad)], -1)
+    moved = moved[:, : n * _POSE_STEPS].reshape(batch, n, _POSE_STEPS, 2).sum(axis=2)
+    distance, heading = (
+        np.hypot(*moved.transpose(2, 0, 1)),
+        np.arctan2(moved[..., 1], moved[..., 0]),
+    )
+    turn = wrap_angles(np.diff(heading, axis=1, append=heading[:, -1:]))
+    config = PoseCellConfig(n_xy=15, cell_size_m=_POSE_CELL_M)
+    cells = PoseCellNetwork(config, batch=batch)
+    told = np.empty((n + 1, batch, 3))
+    with torch.inference_mode():
+        told[0] = cells.estimate.numpy()
+        for i, motion in enumerate(zip(distance.T, turn.T, strict=True)):
+            v, w = (torch.from_numpy(np.ascontiguousarray(x)) for x in motion)
+            told[i + 1] = cells.integrate(Motion(v, w, 1.0)).numpy()
+    torus = np.array([config.n_xy, config.n_xy, config.n_theta])
+    steps_told = (np.diff(told, axis=0) + torus / 2) % torus - torus / 2
+    way = np.cumsum(steps_told, axis=0).transpose(1, 0, 2)
+    # The packet starts in the middle, heading along -x.
+    angle = heading[:, 0] - TWO_PI * told[0, :, 2] / config.n_theta
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    x, y, theta = way.transpose(2, 0, 1)
+    way = np.stack([cos * x - sin * y, sin * x + cos * y, theta], axis=-1)
+    return np.arange(1, n + 1) * _POSE_STEPS - 1, way
+
+
+def visited(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number the cells of a track ``(n, k)``, whole numbers, in the order of their first visit.
+
+    Returns:
+        The cells, ``(m, k)``; when each was first visited, ``(m,)``; number at each step, ``(n,)``.
+
+    Example:
+        >>> visited(np.array([[2, 0], [1, 0], [2, 0]]))[1:]
+        (array([0, 1]), array([0, 1, 0]))
+    """
+    distinct, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.argsort(order)
+    return distinct[order], first[order], rank[number.reshape(-1)]
+
+
+def links_of(numbers: np.ndarray) -> np.ndarray:
+    """Return pairs of places visited in succession, each once, ``(m, 2)``."""
+    pairs = np.sort(np.column_stack([numbers[:-1], numbers[1:]]), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+
+
+class TrackResult(NamedTuple):
+    """All that was told of one track, and what its figures need."""
+
+    name: str
+    walk: Walk
+    told: list[Told]
+    diaries: dict[str, Diary]
+    walls: Wall
+    pose_maps: list[tuple[np.ndarray, np.ndarray]]
+    early_min: float
+
+
+def run_track(
+    data: Path, name: str, minutes: float = 30.0, seeds: Sequence[int] = range(10)
+) -> TrackResult:
+    """Let all methods tell one track under all conditions."""
+    walk = read_track(data, name, minutes)
+    look = partial(sense, walk, seeds=seeds, k=WALLS)
+    senses = {
+        FULL: look(SenseNoise()),
+        WEAK: look(SenseNoise().scaled(0.3)),
+        EASY: look(SenseNoise(), compass_free_bearings=True),
+    }
+    k, at_min = len(seeds), walk.times_s / 60.0 - walk.times_s[0] / 60.0
+    early = int(np.searchsorted(at_min, min(5.0, at_min[-1] / 4)))
+    told = [
+        Told(name, c, PATH, walk.positions, at_min, path_integration(senses[c]))
+        for c in (FULL, WEAK)
+    ]
+    diaries, walls = {}, None
+    for method, conditions in ((SLRB, tuple(senses)), (HEBB, (FULL, WEAK))):
+        some = stacked([senses[c] for c in conditions])
+        diary = Diary(np.isfinite(some.wall_m[..., 0]), walk.positions[0], early)
+        config = BrainConfig(wall_memory={"corrects": method == SLRB})
+        lived = live_with(some, config, diary)
+        diaries[method] = diary
+        if method == SLRB:
+            walls = lived.walls.remembered()[0]
+        for number, condition in enumerate(conditions):
+            rows = slice(number * k, (number + 1) * k)
+            own = [
+                x[:, rows].transpose(1, 0, 2) + walk.positions[0]
+                for x in (diary.estimate, diary.winner)
+            ]
+            counts = Spread(at_min[diary.count_steps], np.array(diary.counted).T[rows])
+            more = diary.single(rows) | {"lost_share": float(diary.lost[:, rows].mean())}
+            told.append(Told(name, condition, method, walk.positions, at_min, *own, counts, more))
+    steps, way = pose_cells_alone(stacked([senses[FULL], senses[WEAK]]))
+    for number, condition in enumerate((FULL, WEAK)):
+        own = way[number * k : (number + 1) * k]
+        told.append(_told_by_pose_cells(name, condition, walk, steps, own))
+    pose_maps = [_pose_map(way[0, : (steps <= stop).sum(), :2], walk) for stop in (early, math.inf)]
+    return TrackResult(name, walk, told, diaries, walls, pose_maps, float(at_min[early]))
+
+
+def _told_by_pose_cells(
+    name: str, condition: str, walk: Walk, steps: np.ndarray, way: np.ndarray
+) -> Told:
+    at_min = (walk.times_s[steps] - walk.times_s[0]) / 60.0
+    nearest = np.round(way)
+    firsts = [visited(one[:, :2].astype(int))[1] for one in nearest]
+    ends = np.append(np.arange(0, len(steps) - 1, _COUNT_EVERY // _POSE_STEPS), len(steps) - 1)
+    counts = np.array([np.searchsorted(first, ends, side="right") for first in firsts])
+    turning = np.concatenate([nearest[..., :2], nearest[..., 2:] % PoseCellConfig().n_theta], -1)
+    with_heading = np.mean([len(visited(one.astype(int))[1]) for one in turning])
+    in_m = (_POSE_CELL_M * x[..., :2] + walk.positions[0] for x in (way, nearest))
+    return Told(
+        name, condition, RATSLAM, walk.positions[steps], at_min, *in_m,
+        Spread(at_min[ends], counts), {"cells_with_heading": float(with_heading)},
+    )  # fmt: skip
+
+
+def _pose_map(way: np.ndarray, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
+    cells, _, numbers = visited(np.round(way).astype(int))
+    return _POSE_CELL_M * cells + walk.positions[0], links_of(numbers)
