@@ -14,6 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from neuroslam.cell_drawing import draw_arena
 from neuroslam.drawing import (
@@ -407,4 +408,6 @@ def _panels(
     for axes in panels:
         draw_arena(axes, arena)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.yaxis.set_major_locator(MaxNLocator(5))
     return figure, panels

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 
+from neuroslam.cell_panels import CellPanels
 from neuroslam.errors import RunError
 from neuroslam.plotting import plot_map, render
 from neuroslam.types import Frame, StepResult
@@ -57,6 +58,11 @@ class TensorBoardRecorder(Recorder):
     and ``run/frames_per_s``. Images: ``view/frame_and_template``, ``cells/activity`` (x-y, and
     x-heading) and ``map/experiences_and_links``. When it closes, the templates go to the projector.
 
+    A brain with place cells has besides: how many there are, boundary cells that were activated,
+    walls, boundary activity, doubt about the place, ``gridness/...`` of each module; and the
+    images ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, ever
+    rarer as they cost ever more.
+
     Args:
         folder: Where the event files go; made if missing.
         scalars_every: Frames between two points of a curve.
@@ -86,6 +92,8 @@ class TensorBoardRecorder(Recorder):
         self._drawn = -1
         self._clock = (time.perf_counter(), 0)
         self._seen = 0
+        self._cells: CellPanels | None = None
+        self._cells_due = 0  # frame
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
         except OSError as error:
@@ -95,6 +103,9 @@ class TensorBoardRecorder(Recorder):
         """Write what is due at this frame."""
         self._last = (result.frame, brain)
         self._seen += 1
+        if brain.config.cells != "pose":
+            self._cells = self._cells or CellPanels()
+            self._cells.note(brain)
         if result.frame % self.scalars_every == 0:
             self._write_scalars(result, brain)
         if result.frame % self.images_every == 0:
@@ -103,7 +114,7 @@ class TensorBoardRecorder(Recorder):
                 template = brain.view.template_image(result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
-            if brain.pose_cells is not None:
+            if brain.config.cells != "place":
                 picture = activity_picture(brain.pose_cells.activity.numpy(force=True))
                 self._write_picture("cells/activity", picture, result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
@@ -115,7 +126,7 @@ class TensorBoardRecorder(Recorder):
             frame, brain = self._last
             self._last = None
             if self._drawn != frame:
-                self._write_map(frame, brain)
+                self._write_map(frame, brain, last=True)
             if brain.view is not None and brain.view.n:
                 self._write_projector(frame, brain)
         self._writer.close()
@@ -132,17 +143,26 @@ class TensorBoardRecorder(Recorder):
         }
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
-        if brain.pose_cells is not None:
+        if brain.config.cells != "place":
             values["cells/peak"] = brain.pose_cells.peak
+        if self._cells is not None:
+            values |= self._cells.scalars(brain)
         for tag, value in values.items():
             self._writer.add_scalar(tag, value, result.frame)
 
-    def _write_map(self, frame: int, brain: "NavigationBrain") -> None:
+    def _write_map(self, frame: int, brain: "NavigationBrain", last: bool = False) -> None:
         links = brain.map.links
         figure = plot_map(
             brain.map.poses, np.column_stack([links.source, links.target]), current=brain.map.pose
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
+        if self._cells is not None and (last or frame >= self._cells_due):
+            self._cells_due = frame + max(self.maps_every, frame // 2)
+            figures, scores = self._cells.draw(brain)
+            for tag, drawn in figures.items():
+                self._write_picture(tag, render(drawn), frame)
+            for tag, score in scores.items():
+                self._writer.add_scalar(tag, score, frame)
         self._drawn = frame
 
     def _write_picture(self, tag: str, picture: np.ndarray, frame: int) -> None:

