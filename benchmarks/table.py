@@ -6,8 +6,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import (
+    bench_arena,
     bench_end_to_end,
     bench_merge,
+    bench_navigation,
     bench_pose_cells,
     bench_relaxation,
     bench_view_search,
@@ -23,6 +25,8 @@ def main() -> None:
         bench_view_search,
         bench_relaxation,
         bench_merge,
+        bench_arena,
+        bench_navigation,
         bench_end_to_end,
     ):
         for row in module.rows():

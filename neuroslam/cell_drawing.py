@@ -180,7 +180,7 @@ def _draw_approach(part: SubFigure, approach: Approach) -> None:
         vmin=0.0,
         vmax=1.0,
     )
-    axes["rates"].set(xlabel="time (s)", ylabel="bearing (°)", yticks=(-90, 0, 90))
+    axes["rates"].set(xlabel="time (s)", ylabel="preferred\nbearing (°)", yticks=(-90, 0, 90))
     axes["rates"].grid(visible=False)
     bar = part.colorbar(picture, ax=axes["rates"], pad=0.02, ticks=(0, 0.5, 1))
     bar.set_label("rate")
@@ -233,7 +233,8 @@ def plot_firing(cells: Sequence[Firing], title: str) -> Figure:
             write_title(places, cell.title)
             draw_rate_map(rates, cell.rate_map, cell.bins, cell.arena)
             draw_autocorrelogram(shifted, cell.rate_map, cell.bins.bin_m)
-            write_title(shifted, cell.note)
+            write_title(rates, "Firing map")
+            write_title(shifted, "Autocorrelogram", cell.note)
         _bars(figure, axes[1:2], axes[2:3])
         key = [Line2D([], [], color=ODOMETRY, lw=1.2, label="track")]
         dot = {"ls": "none", "marker": "o", "ms": 4, "mew": 0, "color": LOOP}
@@ -352,7 +353,9 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
         for ax in axes[:, 0]:
             ax.set_ylabel("grid score (2 at most)")
         figure.legend(
-            handles=list(key.values()), loc="outside lower center", ncols=min(4, len(key))
+            handles=list(key.values()),
+            loc="outside lower center",
+            ncols=len(key) if len(key) < 6 else 4,
         )
     return figure
 

@@ -155,7 +155,7 @@ def recorded_cell(data: Path) -> tuple[Firing, dict[str, Any]]:
         "spikes": len(walk.spikes_s),
         "gridness_silent": silent,
         "gridness_skip": skip,
-        "opexebo": 0.67,
+        "opexebo_on_a_map_of_its_own": 0.67,
     }
 
 
