@@ -17,6 +17,15 @@ EXPERIMENTS = {
     "five-sessions": (_SESSIONS, "five_sessions", None),
     "campus": (_SESSIONS, "campus", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
+    "boundary-scenarios": (
+        "neuroslam.experiments.boundary_cells",
+        "boundary_scenarios",
+        None,
+    ),
+    "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
+    "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
+    "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
+    "threshold-sweep": ("neuroslam.experiments.place_cells", "threshold_sweep", "rodent"),
 }
 """Name -> module, function, folder of its recordings in the data; ``None``: it needs none."""
 
