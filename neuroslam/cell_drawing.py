@@ -348,15 +348,12 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
                     ax.fill_between(x, y - spread, y + spread, color=colour, alpha=0.15, lw=0)
             ax.axhline(0.0, color="#999999", lw=0.8)
             ax.set_xlabel(time_label)
-            ax.xaxis.set_major_locator(MaxNLocator(6))
+            ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 3, 5, 6, 10]))
             write_title(ax, name)
         for ax in axes[:, 0]:
             ax.set_ylabel("grid score (2 at most)")
-        figure.legend(
-            handles=list(key.values()),
-            loc="outside lower center",
-            ncols=len(key) if len(key) < 6 else 4,
-        )
+        columns = len(key) if len(key) < 6 else 4
+        figure.legend(handles=list(key.values()), loc="outside lower center", ncols=columns)
     return figure
 
 

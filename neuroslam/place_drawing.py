@@ -402,7 +402,7 @@ def _panels(
     pad = 0.04 * float((high - low).max())
     low, high = low - pad, high + pad
     tall = _PANEL_IN * float((high - low)[1] / (high - low)[0])
-    size = columns * (_PANEL_IN + 0.85) + aside_in, rows * (tall + 0.75) + 0.7
+    size = columns * (_PANEL_IN + 0.85) + aside_in, rows * (tall + 0.78) + 0.8
     figure = new_figure(*size, title)
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes in panels:

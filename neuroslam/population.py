@@ -93,6 +93,10 @@ class Population(nn.Module, ABC):
     A brain is made of these alone, so that no state can be forgotten when two brains merge.
     """
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_load_state_dict_pre_hook(_make_writable)
+
     @staticmethod
     @abstractmethod
     def merged(loaded: State, partial: State, join: Join) -> State:
@@ -117,6 +121,16 @@ class Population(nn.Module, ABC):
             buffers[name] = value
         else:
             super().__setattr__(name, value)
+
+
+def _make_writable(module: nn.Module, *_unused: object) -> None:
+    """Replace what was made in inference mode, which torch would not let a state be copied into."""
+    for name, buffer in module._buffers.items():
+        if buffer is not None and buffer.is_inference():
+            module._buffers[name] = buffer.clone()
+    for name, parameter in module._parameters.items():
+        if parameter is not None and parameter.is_inference():
+            module._parameters[name] = nn.Parameter(parameter.clone())
 
 
 class Running(Population):

@@ -248,9 +248,11 @@ class WallMemoryConfig(Section):
     sigma_m: float = Field(0.02, gt=0, description="error of a wall's distance")
     sigma_deg: float = Field(5.0, gt=0, description="error of its bearing")
     speed_scale: float = Field(0.02, ge=0, description="constant error of the speed, a share of it")
-    speed_factor: float = Field(0.1, ge=0, description="error of each sample, a share of the speed")
+    speed_factor: float = Field(
+        0.1, ge=0, description="error of the speed that lasts 50 ms, a share of it"
+    )
     speed_add_m_s: float = Field(0.01, ge=0, description="and besides")
-    heading_white_deg: float = Field(3.0, ge=0, description="error of each heading")
+    heading_white_deg: float = Field(3.0, ge=0, description="error of the heading that lasts 50 ms")
     heading_slow_deg: float = Field(1.0, ge=0, description="error of heading that changes slowly")
     heading_slow_s: float = Field(120.0, gt=0, description="within this time")
     gate: float = Field(5.0, gt=0, description="standard deviations; farther off is another wall")
@@ -258,5 +260,5 @@ class WallMemoryConfig(Section):
         0.3, gt=0, description="how far from where a view was learnt it may be recognised"
     )
     lost_after_s: float = Field(
-        3.0, gt=0, description="walls contradict the memory for so long: the animal is lost"
+        4.0, gt=0, description="walls contradict the memory for so long: the animal is lost"
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neuroslam.cells.boundary import ATTENUATION, GROWTH, INHIBITION
-from neuroslam.config import BoundaryCellConfig
+from neuroslam.config import BoundaryCellConfig, BrainConfig, GridCellConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import rate_map
 from neuroslam.experiments import boundary_cells, grid_cells, grid_comparison
@@ -15,6 +15,10 @@ from neuroslam.experiments.census import Gatherer, arena_bins, by_seed, live_gri
 from neuroslam.sensors.arena import named_arena
 from neuroslam.sensors.rodent import roam
 from neuroslam.sensors.senses import NO_NOISE, SenseNoise, sense
+
+FEW = GridCellConfig(
+    spacings_m=(0.3, 0.5), orientations_deg=(0.0, 15.0), n_cells=4, development_steps=500
+)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +109,7 @@ def test_what_is_no_number_is_written_as_null(tmp_path):
 def test_a_census_scores_the_map_since_the_start_and_that_since_the_one_before(walk):
     gatherer = Gatherer(walk, [120.0, 240.0], (1, 1, 2))
     steady = hexagons(walk.positions, 0.5)
-    drifts = np.where(walk.times_s <= 120.0, steady, hexagons(walk.positions + [0.2, 0.1], 0.5))
+    drifts = np.where(walk.times_s <= 120.0, steady, hexagons(walk.positions + 0.15, 0.5))
     for step, rates in enumerate(np.stack([steady, drifts], axis=1)):
         gatherer.add(step, rates)
     early, late = gatherer.census
@@ -113,8 +117,8 @@ def test_a_census_scores_the_map_since_the_start_and_that_since_the_one_before(w
     whole = rate_map(walk.positions, np.float32(steady), arena_bins(walk))
     np.testing.assert_allclose(late.maps[0, 0], whole[0])
     assert late.silent[0, 0, 0] == pytest.approx(gridness(whole)[0])
-    assert late.silent[0, 0, 0] > 1.1
-    assert late.silent[0, 0, 1] < late.silent[0, 0, 0]
+    assert late.skip[0, 0, 0] > 1.1
+    assert late.silent[0, 0, 1] < late.silent[0, 0, 0] - 0.2
     # Since the drift the other is a grid again, only elsewhere.
     assert late.last[0, 0, 1] == pytest.approx(late.last[0, 0, 0], abs=0.15)
     assert (late.n_fields > 5).all()
@@ -127,7 +131,9 @@ def test_a_median_is_taken_over_cells_and_averaged_over_seeds():
 
 
 def test_grid_cells_become_hexagonal_as_an_arena_is_explored(walk):
-    (early, late), errors = live_grid(walk, [0], [30.0, 240.0], noise=NO_NOISE)
+    (early, late), errors = live_grid(
+        walk, [0], [30.0, 240.0], BrainConfig(grid_cells=FEW), NO_NOISE
+    )
     assert median(early.silent) < 0.6
     assert median(late.skip) > 1.1
     assert errors.shape == (1, len(walk.times_s))
@@ -142,8 +148,8 @@ def test_the_other_models_sense_what_ours_do(walk):
 
 
 def test_oscillatory_interference_without_noise_is_a_grid_of_each_spacing(walk):
-    (census,) = grid_comparison.interference_grid(walk, sense(walk, k=2), [240.0])
-    assert census.silent.shape == (1, 5, 24)
+    (census,) = grid_comparison.interference_grid(walk, sense(walk, k=2), [240.0], FEW)
+    assert census.silent.shape == (1, 2, 4)
     assert np.median(census.skip, axis=2).min() > 1.0
     fields = np.median(census.n_fields[0], axis=1)
     assert (np.diff(fields) < 0).all()  # the wider apart, the fewer
@@ -157,7 +163,7 @@ def test_the_recorded_cell_is_a_grid_cell(rodent):
 
 
 def test_grid_scores_are_written_beside_the_papers(rodent, tmp_path):
-    result = grid_cells.grid_scores(rodent, tmp_path, minutes=0.5, n_seeds=1)
+    result = grid_cells.grid_scores(rodent, tmp_path, 0.5, 1, FEW)
     assert [row["arena"] for row in result["rows"]] == ["triangle", "pentagon", "nonagon"]
     assert [row["paper"] for row in result["rows"]] == [0.25, 0.24, 0.20]
     assert [row["directions"] for row in result["directions"]] == [6, 12, 36]
@@ -166,15 +172,15 @@ def test_grid_scores_are_written_beside_the_papers(rodent, tmp_path):
 
 
 def test_the_comparison_writes_every_method_spacing_and_time(rodent, tmp_path):
-    result = grid_comparison.grid_comparison(rodent, tmp_path, 0.6, n_seeds=2, n_other_seeds=1)
+    result = grid_comparison.grid_comparison(rodent, tmp_path, 0.5, 2, 1, FEW)
     methods = ["true motion", "OI", "CAN", "SLRB", "SLRB, no correction"]
     assert [row["method"] for row in result["rows"][::6]] == methods
-    assert len(result["by_spacing"]) == 5 * 5 * 6
+    assert len(result["by_spacing"]) == 5 * 2 * 6
     counts = [row["activated_boundary_cells"] for row in result["boundary_cells"]]
     assert counts == sorted(counts)
     assert counts[-1] > 0
     pictures = {path.name for path in tmp_path.glob("*.png")}
-    spacings = {f"grids_{cm}cm.png" for cm in (30, 35, 46, 60, 78)}
+    spacings = {f"grids_{cm}cm.png" for cm in (30, 50)}
     assert pictures == spacings | {"scores.png", "boundary_cells.png"}
 
 

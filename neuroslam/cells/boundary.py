@@ -54,8 +54,12 @@ def boundary_activity(
         0.467
     """
     near = (reach_m - distance_m).clamp(0.0, reach_m) / reach_m
-    grows = torch.where(distance_m <= reach_m / 2, rate_per_s * dt_s, -rate_per_s * dt_s)
-    return (activity + grows * near).clamp(0.0, 1.0).where(distance_m <= reach_m, 0.0)
+    sign = 2.0 * (distance_m <= reach_m / 2).to(activity) - 1.0
+    return (
+        (activity + rate_per_s * dt_s * sign * near)
+        .clamp(0.0, 1.0)
+        .where(distance_m <= reach_m, 0.0)
+    )
 
 
 def boundary_tuning(

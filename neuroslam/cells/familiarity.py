@@ -15,7 +15,8 @@ SURE = 0.6
 _NEVER, _ALWAYS = 0.02, 0.98
 _SLACK_BINS = 2  # bearings may be off by so many boundary cells
 _FAMILIAR_S = 1.0
-_FORGIVES = 0.5  # what agrees counts less than what contradicts
+_MOST = 5.0  # of the doubt that makes an animal lost
+_FORGIVES = 0.15  # what agrees counts less than what contradicts
 
 
 class Felt(NamedTuple):
@@ -51,11 +52,11 @@ class Familiarity(Running):
     r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
 
     A wall is near where none ever was, or none is felt where one always was, or one is not where
-    it was remembered: while that lasts, ``doubt_s`` grows by the time. It shrinks, half as fast,
-    while a wall that was long known is where it should be; where nothing is felt or known it stays.
-    An animal is ``lost`` when it exceeds ``lost_after_s``, until it has shrunk to half of that.
-    State: seconds of each place cell with
-    each boundary cell (``felt_s``) and in all (``time_s``); the doubt.
+    it was remembered: while that lasts, ``doubt_s`` grows by the time. It shrinks, much slower,
+    while a wall that was long known is where it should be: chance lets many walls fit anywhere.
+    Where nothing is felt or known it stays. An animal is ``lost`` when it exceeds ``lost_after_s``,
+    until it is gone. State: seconds of each place cell with each boundary cell (``felt_s``) and in
+    all (``time_s``); the doubt.
 
     Args:
         config: Of the boundary cells.
@@ -119,10 +120,10 @@ class Familiarity(Running):
         surprise = against | ((torch.maximum(new, missing) > 0) & known)
         agrees = speaks_for & ~surprise
         doubt = self.doubt_s + dt_s * (surprise.to(time) - _FORGIVES * agrees.to(time))
-        self.doubt_s = doubt.clamp(0.0, 2.0 * self.lost_after_s)
+        self.doubt_s = doubt.clamp(0.0, _MOST * self.lost_after_s)
         self.lost = torch.where(
             self.lost,
-            self.doubt_s > 0.5 * self.lost_after_s,
+            self.doubt_s > 0.0,
             self.doubt_s > self.lost_after_s,
         )
         sure = (~surprise & (winner >= 0) & ~self.lost).to(time) * dt_s

@@ -15,6 +15,7 @@ from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
+from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
 from neuroslam.population import Join, Population, State
 from neuroslam.storage import GrowingTable, Scalars
@@ -48,6 +49,10 @@ class NavigationCells(Population):
     Self-motion turns the oscillators' phases, whose pattern the grid cells tell; walls correct the
     phases of all modules by one displacement; place cells compete for the grid's pattern. Who is
     lost goes on by self-motion, and learns nothing until it knows where it is.
+
+    Steps run in inference mode: gradients go through the parts, not through the whole. Animals of
+    a batch look at walls, and let their place cells compete, at the same instants; so one of them
+    does not live bit for bit as it would alone.
 
     Args:
         config: Of the brain; the sections ``boundary_cells``, ``grid_cells``, ``place_cells`` and
@@ -118,6 +123,10 @@ class NavigationCells(Population):
         Raises:
             BadFrame: If a number is not finite or a distance negative; nothing has changed then.
         """
+        if wall_m.shape != wall_bearing_rad.shape:
+            check_walls(wall_m, wall_bearing_rad)
+        if not 0.0 <= dt_s < math.inf:  # NaN too
+            raise BadFrame(f"time since the last step is {dt_s:g} s; expected 0 or more")
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -178,7 +187,9 @@ class NavigationCells(Population):
         )
         felt = torch.empty((0, 2), dtype=torch.float64)
         if walls is not None and len(walls):
-            felt = torch.from_numpy(np.asarray(walls, dtype=np.float64))
+            felt = torch.from_numpy(np.array(walls, dtype=np.float64))
+            if felt.dim() != 2 or felt.shape[1] != 2:
+                raise BadFrame(f"walls have shape {tuple(felt.shape)}; expected (n, 2)")
             felt = felt[felt[:, 0].argsort()]
         device = self.walls.errors.device
         numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)
@@ -210,6 +221,7 @@ class NavigationCells(Population):
     def _view_reach_m(self) -> float:
         return 3.0 * self.config.wall_memory.view_sigma_m
 
+    @torch.inference_mode()
     def see(self, view: ViewMatch) -> bool:
         """Learn where a new view is, or be corrected by where a known one was learnt.
 
@@ -251,6 +263,7 @@ class NavigationCells(Population):
         self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
         return True
 
+    @torch.inference_mode()
     def go_to(self, pose: Pose, sigma_m: float) -> None:
         """Set pose and phases of one animal anew; what it remembers stays.
 
@@ -262,6 +275,7 @@ class NavigationCells(Population):
         self.oscillators.place_at(self.oscillators.position_m.new_tensor([pose.x_m, pose.y_m]))
         now.heading_rad = wrap_angle(pose.theta_rad + self.heading_error_rad)
         self.walls.forget_position(sigma_m)
+        self.place.leave()
         self.familiarity.reset_doubt()
         now.someone_lost = now.views_agree = 0
 

@@ -162,8 +162,11 @@ class CompetitiveHebbianPlaceCells(Running):
         position = (position_m[None] if one else position_m).detach().to(self.centres_m)
         moved = (position - self.landmarks_m).square().sum(-1) > self.leash_m2
         competes, leaves_window = moved.any(1).tolist()
+        if learns is not None:
+            self._flush_time()
+            self._credit(self.winner, learns * dt_s)
         if not competes:
-            self.now.stay_s += dt_s
+            self.now.stay_s += dt_s if learns is None else 0.0
             nobody = torch.zeros_like(self.winner, dtype=torch.bool)
             return self._response(nobody, nobody)
         grid = (grid[None] if one else grid).detach().to(self.weights)
@@ -188,7 +191,7 @@ class CompetitiveHebbianPlaceCells(Running):
             self._flush_time()
             self._enter(changed if learns is None else changed & learns, winner)
             self.winner = winner
-        self.now.stay_s += dt_s
+        self.now.stay_s += dt_s if learns is None else 0.0
         return self._response(recruited, changed)
 
     def _response(self, recruited: Tensor, changed: Tensor) -> PlaceResponse:
@@ -297,11 +300,23 @@ class CompetitiveHebbianPlaceCells(Running):
         self._near = None
         return super()._apply(fn, recurse)
 
+    def leave(self) -> None:
+        """Say that the animal is elsewhere all at once: its next place is no neighbour."""
+        self._flush_time()
+        self.winner = torch.full_like(self.winner, _NO_CELL)
+        self.landmarks_m = torch.full_like(self.landmarks_m, FAR_M)
+
     def _flush_time(self) -> None:
         """Credit the time since the winners last changed to them."""
-        had = (self.winner >= 0).to(self.time_s) * self.now.stay_s
-        self.time_s.scatter_add_(1, self.winner.clamp_min(0)[:, None], had[:, None])
-        self.now.stay_s = 0.0
+        if self.now.stay_s:
+            self._credit(
+                self.winner, torch.full_like(self.winner, self.now.stay_s, dtype=torch.float64)
+            )
+            self.now.stay_s = 0.0
+
+    def _credit(self, winner: Tensor, time_s: Tensor) -> None:
+        had = time_s.to(self.time_s).where(winner >= 0, 0.0)
+        self.time_s.scatter_add_(1, winner.clamp_min(0)[:, None], had[:, None])
 
     def _enter(self, changed: Tensor, winner: Tensor) -> None:
         rows = changed.nonzero()[:, 0]

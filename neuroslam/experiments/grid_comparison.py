@@ -64,6 +64,7 @@ def grid_comparison(
     minutes: float = 30.0,
     n_seeds: int = 10,
     n_other_seeds: int = 3,
+    grid: GridCellConfig = MODULES,
 ) -> dict[str, Any]:
     """Compare grid cells with OI and CAN under one noise on Hafting's track (Tables 2, 3).
 
@@ -76,6 +77,7 @@ def grid_comparison(
         minutes: How long; a census is taken six times. The paper has 30.
         n_seeds: Animals with our cells.
         n_other_seeds: Animals with OI and CAN, whose noise is that of the first of ours.
+        grid: Modules of grid cells; the first is left out where spacings are taken together.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each method and time (Table 3).
@@ -87,16 +89,22 @@ def grid_comparison(
     encounters = Encounters(walk, [60.0 * minutes * k / 9 for k in range(1, 10)])
     senses = sense(walk, SenseNoise(), others, k=WALLS)
     census: dict[str, list[Census]] = {}
-    census["true motion"], _ = live_grid(walk, [0], times, _config(False), NO_NOISE)
-    census["OI"] = interference_grid(walk, senses, times)
-    census["CAN"] = sheet_grid(walk, senses, times)
-    census["SLRB"], errors = live_grid(walk, ours, times, _config(True), watch=encounters)
-    census["SLRB, no correction"], drift = live_grid(walk, ours, times, _config(False))
-    for m, spacing in enumerate(MODULES.spacings_m):
-        figure = plot_grids(_grids(walk, census, m), f"Grid cells with fields {spacing:g} m apart")
+    census["true motion"], _ = live_grid(walk, [0], times, _config(grid, corrects=False), NO_NOISE)
+    census["OI"] = interference_grid(walk, senses, times, grid)
+    census["CAN"] = sheet_grid(walk, senses, times, grid)
+    census["SLRB"], errors = live_grid(
+        walk, ours, times, _config(grid, corrects=True), watch=encounters
+    )
+    census["SLRB, no correction"], drift = live_grid(
+        walk, ours, times, _config(grid, corrects=False)
+    )
+    for m, spacing in enumerate(grid.spacings_m):
+        figure = plot_grids(
+            _grids(walk, census, m), f"Grid cells with fields {spacing:.2f} m apart"
+        )
         save(figure, out / f"grids_{100 * spacing:.0f}cm.png")
     save(
-        plot_scores(_curves(census), "time (min)", "Grid scores on Hafting's track"),
+        plot_scores(_curves(census, grid), "time (min)", "Grid scores on Hafting's track"),
         out / "scores.png",
     )
     save(encounters.plot(), out / "boundary_cells.png")
@@ -106,8 +114,8 @@ def grid_comparison(
             "experiment": "grid-comparison",
             "seeds": {"SLRB": n_seeds, "OI": n_other_seeds, "CAN": n_other_seeds},
             "notes": [
-                "rows: spacings .35 to .78 m together; median over cells, mean over seeds; the "
-                "map from the start until then",
+                "rows: all spacings but the first together; median over cells, mean over seeds; "
+                "the map from the start until then",
                 "gridness_last_*: the map since the census before, which shows drift",
                 "the paper's numbers of cells grow with time; ours are cells with a field, and "
                 "the number of their fields",
@@ -115,14 +123,14 @@ def grid_comparison(
                 "Fig. 13 .031 m: the table contradicts both",
             ],
             "rows": _table_3(census),
-            "by_spacing": _by_spacing(census),
+            "by_spacing": _by_spacing(census, grid),
             "boundary_cells": encounters.rows(errors, drift),
         },
     )
 
 
-def _config(corrects: bool) -> BrainConfig:
-    return BrainConfig(grid_cells=MODULES, wall_memory={"corrects": corrects})
+def _config(grid: GridCellConfig, *, corrects: bool) -> BrainConfig:
+    return BrainConfig(grid_cells=grid, wall_memory={"corrects": corrects})
 
 
 def sensed_velocity(senses: Senses) -> torch.Tensor:
@@ -131,9 +139,11 @@ def sensed_velocity(senses: Senses) -> torch.Tensor:
     return torch.from_numpy((senses.speed_m_s[..., None] * heading).swapaxes(0, 1).copy())
 
 
-def interference_grid(walk: Walk, senses: Senses, times_s: Sequence[float]) -> list[Census]:
+def interference_grid(
+    walk: Walk, senses: Senses, times_s: Sequence[float], grid: GridCellConfig
+) -> list[Census]:
     """Let oscillatory interference integrate what was sensed."""
-    velocity, c = sensed_velocity(senses), MODULES
+    velocity, c = sensed_velocity(senses), grid
     shape = (velocity.shape[1], len(c.spacings_m), c.n_cells)
     cells = OscillatoryInterference(
         c.spacings_m,
@@ -149,14 +159,16 @@ def interference_grid(walk: Walk, senses: Senses, times_s: Sequence[float]) -> l
     return gatherer.census
 
 
-def sheet_grid(walk: Walk, senses: Senses, times_s: Sequence[float]) -> list[Census]:
+def sheet_grid(
+    walk: Walk, senses: Senses, times_s: Sequence[float], grid: GridCellConfig
+) -> list[Census]:
     """Let continuous attractors, one for each spacing, integrate what was sensed."""
     velocity, modules = sensed_velocity(senses), []
-    for spacing, orientation in zip(MODULES.spacings_m, MODULES.orientations_deg, strict=True):
-        shape = (velocity.shape[1], 1, MODULES.n_cells)
+    for spacing, orientation in zip(grid.spacings_m, grid.orientations_deg, strict=True):
+        shape = (velocity.shape[1], 1, grid.n_cells)
         cells = GridSheet(
             spacing,
-            MODULES.n_cells,
+            grid.n_cells,
             orientation_rad=math.radians(orientation),
             parameters=_SHEET,
             batch=shape[0],
@@ -246,7 +258,7 @@ def _table_3(census: dict[str, list[Census]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _by_spacing(census: dict[str, list[Census]]) -> list[dict[str, Any]]:
+def _by_spacing(census: dict[str, list[Census]], grid: GridCellConfig) -> list[dict[str, Any]]:
     return [
         {
             "method": method,
@@ -256,22 +268,24 @@ def _by_spacing(census: dict[str, list[Census]]) -> list[dict[str, Any]]:
             "sd_over_seeds": float(by_seed(now.silent[:, m]).std()),
             "gridness_skip": median(now.skip[:, m]),
             "gridness_last_silent": median(now.last[:, m]),
+            "gridness_silent_by_seed": by_seed(now.silent[:, m]).tolist(),
         }
         for method, taken in census.items()
-        for m, spacing in enumerate(MODULES.spacings_m)
+        for m, spacing in enumerate(grid.spacings_m)
         for now in taken
     ]
 
 
-def _curves(census: dict[str, list[Census]]) -> dict[str, dict[str, Curve]]:
+def _curves(census: dict[str, list[Census]], grid: GridCellConfig) -> dict[str, dict[str, Curve]]:
     panels: dict[str, dict[str, Curve]] = {}
-    names = ["Spacings 0.35 to 0.78 m together", *(f"{s:g} m apart" for s in MODULES.spacings_m)]
-    for name, part in zip(names, (_DEFAULT, *range(len(MODULES.spacings_m))), strict=True):
+    together = f"{grid.spacings_m[1]:.2f} to {grid.spacings_m[-1]:.2f} m apart, together"
+    names = [together, *(f"{spacing:.2f} m apart" for spacing in grid.spacings_m)]
+    for name, part in zip(names, (_DEFAULT, *range(len(grid.spacings_m))), strict=True):
         panels[name] = {}
         for (method, taken), (colour, dash) in zip(census.items(), _STYLES, strict=True):
             minutes = np.array([now.time_s / 60.0 for now in taken])
             scores = np.array([by_seed(now.silent[:, part]) for now in taken])
-            spread = scores.std(axis=1) if scores.shape[1] > 1 else None
+            spread = scores.std(axis=1) if method.startswith("SLRB") else None
             panels[name][method] = Curve(minutes, scores.mean(axis=1), colour, dash, spread)
             if part == _DEFAULT and method in PAPER_TABLE_3 and minutes[-1] == 30.0:
                 paper = np.array(PAPER_TABLE_3[method][0])

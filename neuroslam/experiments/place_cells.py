@@ -6,6 +6,9 @@ Paper: SLRB, Figs. 7, 8, 9, 12 and 13; it gives 0.031 m on the Hafting track aft
 - Competitive Hebb is the same network without the correction by walls; its integrator is plain path
   integration, so what it adds is the error of its winning cell.
 - RatSLAM is its pose cells alone, as in the paper: no view corrects them.
+- That several place cells respond until walls correct (Fig. 8) does not reproduce: drift moves the
+  phases of all modules alike, so the grid's pattern stays sharp, and is of the wrong place.
+- That cells are fewer by half does not reproduce: the drift of the others costs them a fifth more.
 - An error of the winner is that of the winning cell's centre. Cells 0.06 m apart have a floor.
 - By default the bearing of a wall is measured from the true heading and so has the noise of the
   compass in it once that is added. The reference figures were made with bearings measured from the
@@ -22,6 +25,7 @@ import torch
 
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.ratemap import responding
+from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.experiments.animals import TRACKS, WALLS, position_errors, read_track
 from neuroslam.experiments.place_lives import (
     EASY,
@@ -78,9 +82,11 @@ def summarise(told: Sequence[Told]) -> list[dict[str, Any]]:
         drifted = position_errors(free.estimate_m, free.truth_m)
         last = one.minutes >= one.minutes[-1] * 5 / 6
         distance = np.linalg.norm(one.estimate_m - one.truth_m, axis=-1)
+        aligned = [absolute_trajectory_error(x, one.truth_m, "rigid").mean for x in one.estimate_m]
         values = {
             "mean_error_m": errors.mean_m,
             "rmse_m": errors.rmse_m,
+            "mean_error_aligned_m": np.array(aligned),
             "rmse_aligned_m": errors.aligned_m,
             "ratio_to_path_integration": errors.rmse_m / drifted.rmse_m.mean(),
             "ratio_aligned": errors.aligned_m / drifted.aligned_m.mean(),
@@ -151,7 +157,7 @@ def check_targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         targets = (
             ("ratio_to_path_integration", "<=", RATIO_TARGETS[track]),
             ("mean_error_m", "<=", ERROR_TARGETS_M[track]),
-            ("rmse_aligned_m", "<=", ALIGNED_TARGET_M),
+            ("mean_error_aligned_m", "<=", ALIGNED_TARGET_M),
             ("mean_error_m_below_hebb_percent", ">=", BELOW_HEBB_TARGET_PERCENT),
             ("mean_error_m_below_ratslam_percent", ">=", BELOW_RATSLAM_TARGET_PERCENT),
             (growth, "<=", min(GROWTH_TARGET_PERCENT, hebb[growth])),
@@ -283,13 +289,13 @@ def draw_track(result: TrackResult, out: Path) -> None:
 
 
 def _responses(result: TrackResult) -> tuple[int, list[Response]] | None:
-    """Show the instant when the uncorrected network responds with most cells, by the grid alone."""
+    """Show the last instant when the uncorrected network responds with most cells by the grid."""
     before, after = result.diaries[HEBB].looks, result.diaries[SLRB].looks
     common = sorted(before.keys() & after.keys())
     if not common:
         return None
     most = [int(responding(before[i][2][None])[0]) for i in common]
-    step = common[int(np.argmax(most))]
+    step = common[len(most) - 1 - int(np.argmax(most[::-1]))]
     here = result.walk.positions[step]
     return step, [
         Response("Before: uncorrected, grid alone", before[step][0], before[step][2], here),

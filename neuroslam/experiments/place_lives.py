@@ -26,6 +26,9 @@ FULL, WEAK, EASY = "noise 1.0", "noise 0.3", "noise 1.0, bearings from the compa
 
 SLRB, HEBB, RATSLAM, PATH = "SLRB", "competitive Hebb", "RatSLAM", "path integration"
 
+NO_WALLS = {"corrects": False, "lost_after_s": 1e9}
+"""Of the wall memory: walls neither correct, nor tell that the animal is lost and stop learning."""
+
 _COUNT_EVERY = 100  # steps between counts of place cells
 _LOOK_EVERY = 80  # steps between looks at all responses
 _POSE_CELL_M = 0.06  # as the place cells: counts of cells can be compared
@@ -247,7 +250,7 @@ def run_track(
     for method, conditions in ((SLRB, tuple(senses)), (HEBB, (FULL, WEAK))):
         some = stacked([senses[c] for c in conditions])
         diary = Diary(np.isfinite(some.wall_m[..., 0]), walk.positions[0], early)
-        config = BrainConfig(wall_memory={"corrects": method == SLRB})
+        config = BrainConfig(wall_memory={} if method == SLRB else NO_WALLS)
         lived = live_with(some, config, diary)
         diaries[method] = diary
         if method == SLRB:
