@@ -109,7 +109,7 @@ class TensorBoardRecorder(Recorder):
         if result.frame % self.scalars_every == 0:
             self._write_scalars(result, brain)
         if result.frame % self.images_every == 0:
-            if frame.image is not None and brain.view is not None:
+            if frame.image is not None:
                 known = 0 <= result.view.template < brain.view.n
                 template = brain.view.template_image(result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
@@ -127,7 +127,7 @@ class TensorBoardRecorder(Recorder):
             self._last = None
             if self._drawn != frame:
                 self._write_map(frame, brain, last=True)
-            if brain.view is not None and brain.view.n:
+            if brain.view.n:
                 self._write_projector(frame, brain)
         self._writer.close()
 

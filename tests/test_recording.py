@@ -1,5 +1,4 @@
 import io
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,7 +7,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.config import BrainConfig
+from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import RunError
 from neuroslam.recording import (
     NullRecorder,
@@ -16,7 +15,8 @@ from neuroslam.recording import (
     activity_picture,
     frame_beside_template,
 )
-from neuroslam.types import Frame, Motion, StepResult, Velocity, ViewMatch
+from neuroslam.sensors import open_source
+from neuroslam.types import Frame, Velocity
 
 N = 25
 
@@ -123,18 +123,31 @@ def test_of_many_templates_the_projector_gets_an_even_choice(tmp_path):
     assert names[:3] == ["template 0", "template 4", "template 8"]
 
 
-def test_a_brain_without_views_or_pose_cells_is_recorded_too(tmp_path):
-    _, brain = drive(NullRecorder(), n=3)
-    blind = SimpleNamespace(view=None, pose_cells=None, map=brain.map)
-    match = ViewMatch(-1, -1.0, 0.0, False)
-    motion, pose = Motion(0.0, 0.0, 0.1), brain.map.pose
-    result = StepResult(0, 0.0, motion, match, "none", 0, pose, None, 0, 1, 0)
+def test_a_brain_of_boundary_grid_and_place_cells_is_recorded_too(tmp_path):
+    brain = NavigationBrain(build_config(read_preset("slrb")))
     with TensorBoardRecorder(tmp_path) as recorder:
-        recorder.step(result, Frame(0, 0.0), blind)
-    events = EventAccumulator(str(tmp_path))
+        for frame in open_source("arena:square?minutes=1&noise=1"):
+            recorder.step(brain(frame), frame, brain)
+    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
     events.Reload()
-    assert events.Tags()["images"] == ["map/experiences_and_links"]
-    assert "cells/peak" not in events.Tags()["scalars"]
+    tags = events.Tags()
+    assert set(tags["images"]) == {
+        "map/experiences_and_links",
+        "cells/place_map",
+        "cells/boundary_response",
+        "cells/grid_rate_maps",
+    }
+    assert "cells/peak" not in tags["scalars"]
+    assert {"cells/place_cells", "cells/walls", "cells/doubt_s", "gridness/spacing_0.35_m"} <= set(
+        tags["scalars"]
+    )
+    last = events.Scalars("cells/place_cells")[-1]
+    assert last.value == brain.navigation.place.n_cells.item()
+    for tag in tags["images"]:
+        picture = cv2.imdecode(
+            np.frombuffer(events.Images(tag)[-1].encoded_image_string, np.uint8), cv2.IMREAD_COLOR
+        )
+        assert picture.std() > 10.0  # something is drawn
 
 
 def test_recording_does_not_change_what_the_brain_does(tmp_path):
