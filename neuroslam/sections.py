@@ -243,7 +243,7 @@ class WallMemoryConfig(Section):
     spread_m: float = Field(0.25, gt=0, description="a stretch of wall is one memory up to here")
     spread_deg: float = Field(12.0, gt=0, lt=90, description="and within these bearings")
     period_s: float = Field(
-        0.2, ge=0, description="time between looks at a wall that tell something new"
+        0.25, ge=0, description="time between looks at a wall that tell something new"
     )
     sigma_m: float = Field(0.02, gt=0, description="error of a wall's distance")
     sigma_deg: float = Field(5.0, gt=0, description="error of its bearing")

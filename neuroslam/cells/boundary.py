@@ -53,13 +53,9 @@ def boundary_activity(
         >>> round(boundary_activity(torch.tensor(0.2), torch.tensor(0.1), 0.3, 0.8, 0.5).item(), 3)
         0.467
     """
-    near = (reach_m - distance_m).clamp(0.0, reach_m) / reach_m
-    sign = 2.0 * (distance_m <= reach_m / 2).to(activity) - 1.0
-    return (
-        (activity + rate_per_s * dt_s * sign * near)
-        .clamp(0.0, 1.0)
-        .where(distance_m <= reach_m, 0.0)
-    )
+    near = (reach_m - distance_m).clamp_min(0.0) * (rate_per_s * dt_s / reach_m)
+    grown = activity + torch.where(distance_m <= reach_m / 2, near, -near)
+    return grown.clamp(0.0, 1.0).where(distance_m <= reach_m, 0.0)
 
 
 def boundary_tuning(
@@ -92,10 +88,11 @@ def boundary_tuning(
     Returns:
         ``(..., n_bearings, n_distances)``, non-negative.
     """
+    half = math.sqrt(0.5)
     far = distance_m.clamp_max(_FAR_M).unsqueeze(-1) - preferred_m
     apart = (bearing_rad.unsqueeze(-1) - preferred_rad + math.pi).remainder(TWO_PI) - math.pi
-    by_distance = (-0.5 * (far / (sigma_m * (preferred_m / beta_m + 1.0))).square()).exp()
-    by_bearing = (-0.5 * (apart / sigma_rad).square()).exp()
+    by_distance = (far * (half / (sigma_m * (preferred_m / beta_m + 1.0)))).square().neg().exp()
+    by_bearing = (apart * (half / sigma_rad)).square().neg().exp()
     return by_bearing.mT @ by_distance
 
 

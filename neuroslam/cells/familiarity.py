@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Running
+from neuroslam.population import Running, without_gradients
 
 SURE = 0.6
 """Share of the reach within which a wall cannot be overlooked."""
@@ -87,7 +87,7 @@ class Familiarity(Running):
         self.register_buffer("slack", near.float(), persistent=False)
         self.register_load_state_dict_pre_hook(_take_capacity)
 
-    @torch.inference_mode()
+    @without_gradients
     def forward(
         self,
         winner: Tensor,

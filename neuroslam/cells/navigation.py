@@ -17,7 +17,7 @@ from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
-from neuroslam.population import Join, Population, State
+from neuroslam.population import Join, Population, State, without_gradients
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, Pose, ViewMatch
 
@@ -98,7 +98,7 @@ class NavigationCells(Population):
             {name: ((), torch.float64) for name in ("x_m", "y_m", "heading_rad", "sure")}
         )
 
-    @torch.inference_mode()
+    @without_gradients
     def forward(
         self,
         speed_m_s: Tensor,
@@ -221,7 +221,7 @@ class NavigationCells(Population):
     def _view_reach_m(self) -> float:
         return 3.0 * self.config.wall_memory.view_sigma_m
 
-    @torch.inference_mode()
+    @without_gradients
     def see(self, view: ViewMatch) -> bool:
         """Learn where a new view is, or be corrected by where a known one was learnt.
 
@@ -263,7 +263,7 @@ class NavigationCells(Population):
         self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
         return True
 
-    @torch.inference_mode()
+    @without_gradients
     def go_to(self, pose: Pose, sigma_m: float) -> None:
         """Set pose and phases of one animal anew; what it remembers stays.
 

@@ -66,8 +66,9 @@ def restore_amplitude(phases: Tensor) -> Tensor:
 
 
 def _turn(waves: Tensor, at_m: Tensor) -> Tensor:
-    angle = (at_m @ waves.reshape(-1, 2).mT).unflatten(-1, waves.shape[:2])
-    return torch.polar(angle.new_ones(()).expand_as(angle), angle)
+    angle = torch.nn.functional.linear(at_m, waves.view(-1, 2))
+    turn = torch.polar(torch.ones_like(angle), angle)
+    return turn.view(*turn.shape[:-1], *waves.shape[:2])
 
 
 def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor) -> Tensor:

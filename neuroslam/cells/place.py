@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.config import PlaceCellConfig
-from neuroslam.population import Running
+from neuroslam.population import Running, without_gradients
 from neuroslam.storage import Scalars
 
 NEIGHBOURS = 12
@@ -14,7 +14,7 @@ NEIGHBOURS = 12
 
 _WINDOW = 32  # nearest cells, among which the winner is
 _SLACK_M = 0.06  # the animal may move so far before the window is looked up anew
-_STILL = 1 / 6  # of the distance between cells; who moved less has the same winner
+_STILL = 1 / 4  # of the distance between cells; who moved less has the same winner
 _ROOM = 64  # cells that a table begins with
 _NO_CELL = -1
 FAR_M = 1e6
@@ -142,13 +142,13 @@ class CompetitiveHebbianPlaceCells(Running):
     def _forget_window(self) -> None:
         self._near = None
 
-    @torch.inference_mode()
+    @without_gradients
     def forward(
         self, grid: Tensor, position_m: Tensor, dt_s: float, *, learns: Tensor | None = None
     ) -> PlaceResponse:
         """Let the cells compete; recruit one where none is near, and let the winner learn.
 
-        Nothing is done while all animals are within a sixth of ``threshold_m`` of where the cells
+        Nothing is done while all animals are within a quarter of ``threshold_m`` of where the cells
         competed last: who stands still has the same winner, and it is not taught the same again.
 
         Args:
@@ -199,7 +199,7 @@ class CompetitiveHebbianPlaceCells(Running):
             return PlaceResponse(self.winner, recruited, changed)
         return PlaceResponse(self.winner[0], recruited[0], changed[0])
 
-    @torch.inference_mode()
+    @without_gradients
     def responses(self, grid: Tensor, position_m: Tensor | None = None) -> Tensor:
         """Return the responses of all cells, ``([batch,] n)``, zero where there is none.
 
@@ -286,7 +286,7 @@ class CompetitiveHebbianPlaceCells(Running):
             after = after.where(learns[:, None, None], before)
         near.scatter_(1, at, after)
 
-    @torch.inference_mode()
+    @without_gradients
     def _write_back(self, rows: Tensor | None = None) -> None:
         """Bring what was learnt in the windows, of some animals or all, into the table."""
         if self._near is None:

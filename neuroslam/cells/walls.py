@@ -17,7 +17,7 @@ from torch import Tensor
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Running
+from neuroslam.population import Running, without_gradients
 from neuroslam.storage import Scalars
 
 OWN = 4
@@ -170,7 +170,7 @@ class WallMemory(Running):
             for rows, n in zip(self._up_to_date(), self.n_walls.tolist(), strict=True)
         ]
 
-    @torch.inference_mode()
+    @without_gradients
     def move(self, speed_m_s: Tensor, heading_rad: Tensor, dt_s: float) -> Tensor:
         """Return the displacement in the world, ``([batch,] 2)``, with the learnt errors taken off.
 
@@ -190,7 +190,7 @@ class WallMemory(Running):
         self.since.time_s += dt_s
         return step if self.batch is not None else step[0]
 
-    @torch.inference_mode()
+    @without_gradients
     def look(
         self,
         position_m: Tensor,
@@ -236,7 +236,7 @@ class WallMemory(Running):
         correction = position - start
         return correction[0] if one else correction
 
-    @torch.inference_mode()
+    @without_gradients
     def evidence(
         self, position_m: Tensor, distance_m: Tensor, bearing_rad: Tensor, sure_m: float
     ) -> tuple[Tensor, Tensor]:
@@ -273,7 +273,7 @@ class WallMemory(Running):
         self.accepted = torch.zeros_like(self.accepted)
         return against, speaks_for & ~against
 
-    @torch.inference_mode()
+    @without_gradients
     def observe_position(self, position_m: Tensor, seen_at_m: Tensor, sigma_m: float) -> Tensor:
         """Take in a position that something else tells, as a view does.
 
@@ -296,7 +296,7 @@ class WallMemory(Running):
         correction = change[:, :2]
         return correction[0] if self.batch is None else correction
 
-    @torch.inference_mode()
+    @without_gradients
     def forget_position(self, sigma_m: float) -> None:
         """Say that the position is unknown but for ``sigma_m``, as after it was set anew."""
         fresh = self.covariance.clone()
