@@ -229,7 +229,7 @@ class PlaceCellConfig(Section):
     """Place cells: recruited where none is near, and learning to compete for grid patterns."""
 
     threshold_m: float = Field(0.06, gt=0, description="no two place cells are nearer than this")
-    power: float = Field(60.0, gt=0, description="of the response; larger: sharper fields")
+    power: float = Field(90.0, gt=0, description="of the response; larger: sharper fields")
     continuity_m: float = Field(
         0.15, gt=0, description="width around the position within which cells compete"
     )

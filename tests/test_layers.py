@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 FLOW = [
     "errors", "types", "geometry", "sections", "config", "storage", "population", "vision",
     "sensors", "odometry", "view", "cells", "mapping", "brain",
-    "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "cell_panels", "merge_drawing", "recording", "run_files",
+    "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "cell_panels",
+    "merge_drawing", "recording", "run_files",
     "inspection", "export",
     "review", "runs", "merging", "demo",
     "experiments", "cli",

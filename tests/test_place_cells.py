@@ -25,7 +25,7 @@ FIRST_WINDOW = 32
 seeds = st.integers(0, 10_000)
 
 
-def strides(arena, minutes, seed=0, at_least_m=0.012, rate_hz=2.0):
+def strides(arena, minutes, seed=0, at_least_m=0.017, rate_hz=2.0):
     """A walk of which every step is long enough for the cells to compete anew."""
     walk = roam(named_arena(arena), minutes, np.random.default_rng(seed), rate_hz)
     kept = [walk.positions[0]]

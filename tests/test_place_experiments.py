@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neuroslam.experiments import place_cells as experiment
 from neuroslam.experiments import place_lives as lives
-from neuroslam.experiments.animals import live, read_track
+from neuroslam.experiments.animals import live, live_with, read_track
 from neuroslam.place_drawing import Spread
 from neuroslam.sensors.senses import NO_NOISE, SenseNoise, sense
 
@@ -112,7 +112,7 @@ def test_neighbours_in_a_batch_do_not_change_where_an_animal_is(data):
     senses = [sense(walk, SenseNoise().scaled(s), SEEDS, k=2) for s in (1.0, 0.3)]
     both = lives.stacked(senses)
     diary = lives.Diary(np.isfinite(both.wall_m[..., 0]), walk.positions[0], 0)
-    lives.live_with(both, experiment.BrainConfig(), diary)
+    live_with(both, experiment.BrainConfig(), diary)
     alone = live(walk, SEEDS).estimate_m
     told = diary.estimate[:, :2].transpose(1, 0, 2) + walk.positions[0]
     np.testing.assert_allclose(told, alone, atol=1e-6)

@@ -156,6 +156,9 @@ class NavigationCells(Population):
             sure_m = SURE * self.config.boundary_cells.reach_m
             evidence = memory.evidence(x, felt_m, felt_rad, sure_m)
             lost = self.familiarity(self.place.winner, felt_m, felt_rad, evidence, now.since_s)
+            if not self.config.wall_memory.corrects:  # walls are only felt: they contradict nothing
+                self.familiarity.reset_doubt()
+                lost = self.familiarity.lost
             now.lost_s += now.since_s * int(lost.sum())
             now.since_s, now.someone_lost = 0.0, int(lost.any())
         return Whereabouts(

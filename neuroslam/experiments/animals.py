@@ -90,24 +90,31 @@ def live(
         hook: Called after every step.
     """
     senses = sense(walk, noise or SenseNoise(), seeds, k=WALLS)
-    cells = NavigationCells(config or BrainConfig(), batch=len(seeds))
+    steps = len(senses.time_s)
+    estimate = np.empty((steps, len(seeds), 2))
+    lost = np.empty((steps, len(seeds)), dtype=bool)
+
+    def note(i: int, here: Whereabouts, cells: NavigationCells) -> None:
+        estimate[i], lost[i] = here.position_m.numpy(), here.lost.numpy()
+        if hook is not None:
+            hook(i, here, cells)
+
+    cells = live_with(senses, config or BrainConfig(), note)
+    return Life(walk, senses, np.moveaxis(estimate, 1, 0) + walk.positions[0], lost.T.copy(), cells)
+
+
+def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCells:
+    """Let navigation cells live through what was sensed; returns them as they are at the end."""
+    cells = NavigationCells(config, batch=len(senses.speed_m_s))
     columns = [
         torch.from_numpy(np.ascontiguousarray(np.moveaxis(column, 1, 0)))
         for column in (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
     ]
-    steps = len(senses.time_s)
-    estimate = np.empty((steps, len(seeds), 2))
-    lost = np.empty((steps, len(seeds)), dtype=bool)
-    dt_s = senses.dt_s.tolist()
     with torch.inference_mode():
-        for i, (speed, heading, wall, bearing) in enumerate(zip(*columns, strict=True)):
-            here = cells(speed, heading, dt_s[i], wall, bearing)
-            estimate[i], lost[i] = here.position_m.numpy(), here.lost.numpy()
-            if hook is not None:
-                hook(i, here, cells)
-    return Life(
-        walk, senses, np.moveaxis(estimate, 1, 0) + walk.positions[0], lost.T.copy(), cells
-    )
+        for i, dt_s in enumerate(senses.dt_s.tolist()):
+            speed, heading, wall, bearing = (column[i] for column in columns)
+            hook(i, cells(speed, heading, dt_s, wall, bearing), cells)
+    return cells
 
 
 def path_integration(senses: Senses) -> np.ndarray:

@@ -8,8 +8,8 @@ Paper: SLRB, Figs. 7, 8, 9, 12 and 13; it gives 0.031 m on the Hafting track aft
 - RatSLAM is its pose cells alone, as in the paper: no view corrects them.
 - That several place cells respond until walls correct (Fig. 8) does not reproduce: drift moves the
   phases of all modules alike, so the grid's pattern stays sharp, and is of the wrong place.
-- That cells are fewer by half does not reproduce: competitive Hebb has 15 to 30 % more. RatSLAM has
-  70 to 90 % more, but for another reason: its cells are a lattice, which takes more to cover a plane
+- That cells are fewer by half does not reproduce: competitive Hebb has 15 to 30 % more. RatSLAM
+  has 70 to 90 % more, for another reason: its cells are a lattice, which needs more for a plane
   than places that keep a distance.
 - An error of the winner is that of the winning cell's centre. Cells 0.06 m apart have a floor.
 - By default the bearing of a wall is measured from the true heading and so has the noise of the
@@ -28,7 +28,7 @@ import torch
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.experiments.animals import TRACKS, WALLS, position_errors, read_track
+from neuroslam.experiments.animals import TRACKS, WALLS, live_with, position_errors, read_track
 from neuroslam.experiments.place_lives import (
     EASY,
     FULL,
@@ -39,7 +39,6 @@ from neuroslam.experiments.place_lives import (
     Diary,
     Told,
     TrackResult,
-    live_with,
     run_track,
 )
 from neuroslam.place_drawing import (

@@ -14,7 +14,7 @@ from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.cells.walls import Wall
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.evaluation.ratemap import responding
-from neuroslam.experiments.animals import WALLS, Hook, path_integration, read_track
+from neuroslam.experiments.animals import WALLS, live_with, path_integration, read_track
 from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.place_drawing import Spread
 from neuroslam.sensors.rodent import Walk
@@ -26,7 +26,7 @@ FULL, WEAK, EASY = "noise 1.0", "noise 0.3", "noise 1.0, bearings from the compa
 
 SLRB, HEBB, RATSLAM, PATH = "SLRB", "competitive Hebb", "RatSLAM", "path integration"
 
-NO_WALLS = {"corrects": False, "lost_after_s": 1e9}
+NO_WALLS = {"corrects": False}
 """Of the wall memory: walls neither correct, nor tell that the animal is lost and stop learning."""
 
 _COUNT_EVERY = 100  # steps between counts of place cells
@@ -129,20 +129,6 @@ def stacked(senses: Sequence[Senses]) -> Senses:
     return senses[0]._replace(
         **{c: np.concatenate([getattr(s, c) for s in senses]) for c in columns}
     )
-
-
-def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCells:
-    """Let navigation cells live through what was sensed; returns them as they are at the end."""
-    cells = NavigationCells(config, batch=len(senses.speed_m_s))
-    columns = [
-        torch.from_numpy(np.ascontiguousarray(np.moveaxis(column, 1, 0)))
-        for column in (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
-    ]
-    with torch.inference_mode():
-        for i, dt_s in enumerate(senses.dt_s.tolist()):
-            speed, heading, wall, bearing = (column[i] for column in columns)
-            hook(i, cells(speed, heading, dt_s, wall, bearing), cells)
-    return cells
 
 
 class PoseCellWay(NamedTuple):
