@@ -374,6 +374,8 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         f"{figures['templates']} templates, {figures['experiences']} experiences, "
         f"{figures['links']} links, {figures['loop_closures']} loop closures"
     )
+    if not figures["experiences"]:
+        console.print("No places: there was nothing to recognise. Without a camera: --preset slrb")
     if "place_cells" in figures:
         lost = figures["lost_s"]
         console.print(
