@@ -50,6 +50,7 @@ def join_brains(
     reports = [report]
     if merged is None:
         return None, reports
+    merged.sessions.merges[-1] = report.to_dict()
     left = list(merged.stored)
     while left:
         more = _join_one(merged, left)

@@ -25,6 +25,7 @@ def test_there_are_notebooks():
         "01_pose_cells",
         "02_map_a_video",
         "03_two_sessions",
+        "04_cells_of_a_rat",
     ]
 
 
