@@ -178,6 +178,30 @@ def test_who_sees_recovers_from_being_carried(carried):
     assert len(brain.stored) == 0
 
 
+def test_views_say_how_the_frames_of_two_sessions_lie():
+    frames = [
+        list(open_source(f"world:ellipse?laps=3&noise=0.03&ranges=90&seed={seed}").frames(*cut))
+        for seed, cut in ((0, (0, 420)), (5, (600, 760)))
+    ]
+    first, second = brain_of("ratslam_slrb"), brain_of("ratslam_slrb")
+    first.about = ("first", "", "")
+    there, truth = [], np.array([f.truth[:2] for f in frames[0]])
+    for frame in frames[0]:
+        first(frame)
+        there.append(first.navigation.pose[:2])
+    lies = align(np.array(there), truth)
+    second.store(first)
+    n_views, off = [first.view.n], []
+    for frame in frames[1]:
+        second(frame)
+        if not len(second.stored):
+            at = lies.apply(np.array([second.navigation.pose[:2]]))
+            off.append(np.linalg.norm(at - frame.truth[:2]))
+    assert len(off) > 80  # it was joined early
+    assert np.mean(off) < 1.0  # of the 12 m by which the frames were apart
+    assert second.navigation.seen.n == second.view.n >= n_views[0]
+
+
 def test_walls_make_the_map_of_views_better():
     errors = {}
     for cells in ("pose", "pose_and_place"):
