@@ -7,15 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells import walls as walls_module
-from neuroslam.cells.walls import (
-    OWN,
-    Wall,
-    WallMemory,
-    check_motion,
-    unlikeness,
-    wall_innovation,
-    wrap,
-)
+from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, wrap
+from neuroslam.cells.walls import OWN, WallMemory, check_motion
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
 from neuroslam.sensors.arena import Arena, named_arena

@@ -8,10 +8,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neuroslam.cells.boundary_vectors import unlikeness, wrap
 from neuroslam.cells.grid import lahn_drive
 from neuroslam.cells.oscillators import turn_phases, wave_vectors
 from neuroslam.cells.place import EMPTY, FAR_M, NEIGHBOURS
-from neuroslam.cells.walls import unlikeness, wrap
 from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.population import Join, State
 from neuroslam.types import Pose

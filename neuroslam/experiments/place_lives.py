@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from neuroslam.cells.boundary_vectors import Wall
 from neuroslam.cells.navigation import NavigationCells, Whereabouts
 from neuroslam.cells.pose import PoseCellNetwork
-from neuroslam.cells.walls import Wall
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.experiments.animals import WALLS, live_with, path_integration, read_track

@@ -4,7 +4,6 @@ An outline is ``(n, 2)`` vertices in metres in either sense, not repeating the f
 numbers ``(x, y, radius)`` of a circle.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -14,8 +13,19 @@ from numpy.typing import ArrayLike
 
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI
+from neuroslam.sensors.outlines import (
+    TOUCH_M,
+    bearings_of,
+    checked_outline,
+    checked_walls,
+    cross,
+    crossings,
+    meet,
+    to_segments,
+    vertices_of,
+    within,
+)
 
-_TOUCH_M = 1e-9  # whoever is nearer to a wall than this stands at it, on the side that is free
 _CHUNK = 25_600  # numbers in a temporary: what a core keeps close to itself
 
 
@@ -37,12 +47,12 @@ class _Blockers(NamedTuple):
         t, s = t[:, None], s[:, None]
         low, high, base, slope = self.segments.T
         there = base + slope * t
-        hidden = (t >= low - _TOUCH_M) & (t <= high + _TOUCH_M)
-        hidden &= (there > _TOUCH_M) & (there < s - _TOUCH_M)
+        hidden = (t >= low - TOUCH_M) & (t <= high + TOUCH_M)
+        hidden &= (there > TOUCH_M) & (there < s - TOUCH_M)
         along, off, radius = self.circles.T
         depth = radius**2 - (t - along) ** 2
         there = off - np.sqrt(np.maximum(depth, 0.0))
-        behind = (depth > 0.0) & (there > _TOUCH_M) & (there < s - _TOUCH_M)
+        behind = (depth > 0.0) & (there > TOUCH_M) & (there < s - TOUCH_M)
         return hidden.any(axis=1) | behind.any(axis=1)
 
 
@@ -80,9 +90,9 @@ class Arena:
         name: str = "arena",
     ) -> None:
         self.name = name
-        self.boundary = _outline(vertices, f"{name}: the boundary")
-        self.holes = [_outline(hole, f"{name}: hole {k}") for k, hole in enumerate(holes)]
-        self.walls = _free_walls(walls, name)
+        self.boundary = checked_outline(vertices, f"{name}: the boundary")
+        self.holes = [checked_outline(hole, f"{name}: hole {k}") for k, hole in enumerate(holes)]
+        self.walls = checked_walls(walls, name)
         # The free side is on the left of every side: boundaries run ccw, holes clockwise.
         around = [] if self.boundary.ndim == 1 else [self.boundary]
         around += [hole[::-1] for hole in self.holes if hole.ndim == 2]
@@ -95,7 +105,7 @@ class Arena:
         self._half = np.hypot(*span.T) / 2
         self._along = span / (2 * self._half[:, None])
         self._normal = np.column_stack([-self._along[:, 1], self._along[:, 0]])
-        self._bearing = _bearings(-self._normal)
+        self._bearing = bearings_of(-self._normal)
         self._round = self.boundary.ndim == 1
         circles = [outline for outline in (self.boundary, *self.holes) if outline.ndim == 1]
         self._circles = np.array(circles).reshape(-1, 3)
@@ -216,7 +226,7 @@ class Arena:
         """Whether every wall is seen from everywhere: a convex boundary and nothing in it."""
         if self.holes or len(self.walls):
             return False
-        turn = _cross(self._along, np.roll(self._along, -1, 0))
+        turn = cross(self._along, np.roll(self._along, -1, 0))
         return self._round or bool(np.all(turn > -1e-12))
 
     @cached_property
@@ -231,7 +241,7 @@ class Arena:
     @property
     def outlines(self) -> list[np.ndarray]:
         """Lines to draw, ``(n, 2)``: boundary, holes, walls; closed, circles of 180 points."""
-        closed = [_vertices(outline) for outline in (self.boundary, *self.holes)]
+        closed = [vertices_of(outline) for outline in (self.boundary, *self.holes)]
         return [np.vstack([line, line[:1]]) for line in closed] + list(self.walls)
 
     def contains(self, positions: ArrayLike) -> np.ndarray:
@@ -239,11 +249,11 @@ class Arena:
         points = self._points(positions)
         inside = np.empty(len(points), dtype=bool)
         for rows in self._chunks(len(points)):
-            inside[rows] = _within(points[rows], self.boundary)
+            inside[rows] = within(points[rows], self.boundary)
             for hole in self.holes:
-                inside[rows] &= ~_within(points[rows], hole)
+                inside[rows] &= ~within(points[rows], hole)
         unsure = np.flatnonzero(~inside)
-        inside[unsure] = self._clearance(points[unsure], self._n_sides) <= _TOUCH_M
+        inside[unsure] = self._clearance(points[unsure], self._n_sides) <= TOUCH_M
         return inside
 
     def check_inside(self, positions: ArrayLike) -> None:
@@ -306,7 +316,7 @@ class Arena:
             np.abs(t, out=t)
             seen = t <= 1.0
             seen &= s <= reach
-            seen &= s >= -_TOUCH_M
+            seen &= s >= -TOUCH_M
             # Views: the wall's number is the column, and few are seen.
             near, towards = distance[rows, :n_straight], bearing[rows, :n_straight]
             np.copyto(near, s, where=seen)
@@ -381,14 +391,14 @@ class Arena:
         side = np.where(s < 0.0, -1.0, 1.0)
         side[:, : self._n_sides] = 1.0  # the others have two faces
         s = s * side
-        s = np.where(s >= -_TOUCH_M, np.maximum(s, 0.0), np.inf)
+        s = np.where(s >= -TOUCH_M, np.maximum(s, 0.0), np.inf)
         # Walls first, rays last: the reduction over walls is then one of whole rows.
         s, t, side = (np.repeat(a.T, repeat, axis=1) for a in (s, t, side))
         closing = -(self._off[0].T @ ray.T) * side
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             along = s / closing
             t += along * (self._on[0].T @ ray.T)
-            hit = (closing > 0.0) & (np.abs(t) <= 1.0 + _TOUCH_M)
+            hit = (closing > 0.0) & (np.abs(t) <= 1.0 + TOUCH_M)
         first = np.where(hit, along, np.inf).min(axis=0, initial=np.inf)
         for k, (x, y, radius) in enumerate(self._circles.tolist()):
             from_centre = np.repeat(points - (x, y), repeat, axis=0)
@@ -411,10 +421,10 @@ class Arena:
         out = points - self._circles[k, :2]
         gap = np.hypot(*out.T) - self._circles[k, 2]
         gap, out = (-gap, out) if around else (gap, -out)
-        rows = np.flatnonzero((gap >= -_TOUCH_M) & (gap <= reach))
+        rows = np.flatnonzero((gap >= -TOUCH_M) & (gap <= reach))
         if not len(rows):
             return
-        gap, towards = np.maximum(gap[rows], 0.0), _bearings(out[rows])
+        gap, towards = np.maximum(gap[rows], 0.0), bearings_of(out[rows])
         if not self.is_convex:
             unit = np.column_stack([np.cos(towards), np.sin(towards)])
             free = ~self._between(points[rows], points[rows] + gap[:, None] * unit, k)
@@ -428,13 +438,13 @@ class Arena:
         for rows in self._chunks(len(here)):
             (s0, t0), (s1, t1) = self._frames(here[rows]), self._frames(there[rows])
             apart = np.where(s0 == s1, 1.0, s0 - s1)
-            on = np.abs(t0 + (t1 - t0) * s0 / apart) <= 1.0 + _TOUCH_M
-            across = (np.minimum(s0, s1) < -_TOUCH_M) & (np.maximum(s0, s1) > _TOUCH_M)
+            on = np.abs(t0 + (t1 - t0) * s0 / apart) <= 1.0 + TOUCH_M
+            across = (np.minimum(s0, s1) < -TOUCH_M) & (np.maximum(s0, s1) > TOUCH_M)
             hidden[rows] = (on & across).any(axis=1)
         for k in range(int(self._round), len(self._circles)):
             if k != circle:
-                gap = _to_segments(self._circles[k : k + 1, :2], here, there)[0]
-                hidden |= gap < self._circles[k, 2] - _TOUCH_M
+                gap = to_segments(self._circles[k : k + 1, :2], here, there)[0]
+                hidden |= gap < self._circles[k, 2] - TOUCH_M
         return hidden
 
     def _finish_straight(
@@ -451,7 +461,7 @@ class Arena:
             hidden = left.hide(t, s)
             if right:
                 turned = s < 0.0
-                bearing[at[turned], wall] = _bearings(self._normal[wall : wall + 1])
+                bearing[at[turned], wall] = bearings_of(self._normal[wall : wall + 1])
                 hidden = np.where(turned, right[0].hide(t, -s), hidden)
             distance[at[hidden], wall], bearing[at[hidden], wall] = np.inf, 0.0
 
@@ -467,13 +477,13 @@ class Arena:
             )
             low, high, run = np.minimum(t0, t1), np.maximum(t0, t1), t1 - t0
             # A wall at right angles to this one stands along the line of sight, not across it.
-            over = (low < half) & (high > -half) & (np.abs(run) > _TOUCH_M)
+            over = (low < half) & (high > -half) & (np.abs(run) > TOUCH_M)
             over[i] = False
             slope = (s1 - s0) / np.where(over, run, 1.0)
             t, s = ((pillars[:, :2] - self._middle[i]) @ frame).T
             faces = []
             for side in (1.0, -1.0) if i >= self._n_sides else (1.0,):
-                use = over & (np.maximum(side * s0, side * s1) > _TOUCH_M)
+                use = over & (np.maximum(side * s0, side * s1) > TOUCH_M)
                 lines = np.column_stack([low, high, side * (s0 - t0 * slope), side * slope])
                 use_pillar = (np.abs(t) < half + pillars[:, 2]) & (side * s > -pillars[:, 2])
                 circles = np.column_stack([t, side * s, pillars[:, 2]])
@@ -515,15 +525,15 @@ class Arena:
     def _check_holes(self) -> None:
         for k, hole in enumerate(self.holes):
             who = f"{self.name}: hole {k}"
-            if _meet(hole, self.boundary):
+            if meet(hole, self.boundary):
                 raise SourceError(f"{who} crosses or touches the boundary; expected it inside")
-            if not _within(_vertices(hole)[:1], self.boundary)[0]:
+            if not within(vertices_of(hole)[:1], self.boundary)[0]:
                 raise SourceError(f"{who} lies outside the boundary; expected it inside")
             for other, outline in enumerate(self.holes[:k]):
-                inside = _within(_vertices(hole)[:1], outline) | _within(
-                    _vertices(outline)[:1], hole
+                inside = within(vertices_of(hole)[:1], outline) | within(
+                    vertices_of(outline)[:1], hole
                 )
-                if inside[0] or _meet(hole, outline):
+                if inside[0] or meet(hole, outline):
                     raise SourceError(
                         f"{who} and hole {other} touch or overlap; expected them apart, or as one"
                     )
@@ -533,10 +543,10 @@ class Arena:
             who = f"{self.name}: wall {k} from {tuple(ends[0].tolist())} to "
             who += f"{tuple(ends[1].tolist())} m"
             n = self._n_sides
-            crossed = _crossings(ends[:1], ends[1:], self._starts[:n], self._ends[:n]).any()
+            crossed = crossings(ends[:1], ends[1:], self._starts[:n], self._ends[:n]).any()
             for pillar in self._circles[int(self._round) :]:
-                gap = _to_segments(pillar[None, :2], ends[:1], ends[1:])
-                crossed |= bool(gap[0, 0] < pillar[2] - _TOUCH_M)
+                gap = to_segments(pillar[None, :2], ends[:1], ends[1:])
+                crossed |= bool(gap[0, 0] < pillar[2] - TOUCH_M)
             if crossed:
                 raise SourceError(f"{who} crosses the boundary or a hole; end it there")
             if not self.contains([ends[0], ends.mean(axis=0), ends[1]]).all():
@@ -585,116 +595,3 @@ _NAMED: dict[str, Callable[[str], Arena]] = {
     "two_rooms": lambda name: Arena.rooms(name=name),
     "pillar": lambda name: Arena(_box(2.0, 2.0), holes=[(0.0, 0.0, 0.25)], name=name),
 }
-
-
-def _bearings(directions: np.ndarray) -> np.ndarray:
-    """Angles of vectors ``(n, 2)``, in (-pi, pi]."""
-    angle = np.arctan2(directions[:, 1], directions[:, 0])
-    return np.where(angle <= -math.pi, math.pi, angle) + 0.0  # no negative zeros
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _vertices(outline: np.ndarray) -> np.ndarray:
-    if outline.ndim == 2:
-        return outline
-    angle = TWO_PI * np.arange(180) / 180
-    return outline[:2] + outline[2] * np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _outline(values: ArrayLike, who: str) -> np.ndarray:
-    """Check an outline; polygons come back counter-clockwise."""
-    outline = np.array(values, dtype=np.float64)
-    if outline.shape != (3,) and (outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3):
-        raise SourceError(
-            f"{who} has shape {outline.shape}; expected (n, 2) vertices, at least 3, or the centre "
-            "and radius of a circle (3,)"
-        )
-    if not np.isfinite(outline).all():
-        raise SourceError(f"{who} has numbers that are not finite; expected metres")
-    if outline.ndim == 1:
-        if outline[2] <= 0:
-            raise SourceError(f"{who} has the radius {outline[2]:g} m; expected more than 0")
-        return outline
-    n, side = len(outline), np.roll(outline, -1, 0) - outline
-    short = np.flatnonzero(np.hypot(*side.T) <= _TOUCH_M)
-    if len(short):
-        raise SourceError(
-            f"{who}: side {short[0]} has no length; expected vertices apart, the first not repeated"
-        )
-    ends = np.roll(outline, -1, 0)
-    cross = _crossings(outline, ends, outline, ends)
-    touch = _to_segments(outline, outline, ends) <= _TOUCH_M
-    at = np.arange(n)
-    touch[at, at] = touch[at, at - 1] = False  # a vertex is on the two sides that it joins
-    i, j = np.nonzero(cross | touch)
-    if len(i):
-        raise SourceError(f"{who} meets itself at sides {i[0]} and {j[0]}; expected a simple one")
-    return outline if _cross(outline, ends).sum() > 0 else outline[::-1].copy()
-
-
-def _free_walls(walls: Sequence[ArrayLike], name: str) -> np.ndarray:
-    found = np.empty((len(walls), 2, 2))
-    for k, wall in enumerate(walls):
-        ends = np.asarray(wall, dtype=np.float64)
-        if ends.shape != (2, 2) or not np.isfinite(ends).all():
-            raise SourceError(
-                f"{name}: wall {k} has shape {ends.shape} or numbers that are not finite; expected "
-                "two ends (2, 2) in metres"
-            )
-        if math.dist(*ends.tolist()) <= _TOUCH_M:
-            raise SourceError(f"{name}: wall {k} has no length; expected two ends apart")
-        found[k] = ends
-    return found
-
-
-def _within(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Tell which points ``(n, 2)`` are inside one outline: a ray to the right crosses it oddly."""
-    if outline.ndim == 1:
-        return np.hypot(*(points - outline[:2]).T) < outline[2]
-    (x0, y0), (x1, y1) = outline.T, np.roll(outline, -1, 0).T
-    x, y = points[:, :1], points[:, 1:]
-    lean = (x1 - x0) / np.where(y1 == y0, 1.0, y1 - y0)
-    crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * lean)
-    return np.logical_xor.reduce(crossed, axis=1)
-
-
-def _to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Distance of points ``(n, 2)`` to segments ``(m, 2)``, ``(n, m)``."""
-    span, gap = ends - starts, points[:, None] - starts
-    squared = np.sum(span**2, axis=1)
-    along = np.sum(gap * span, axis=2) / np.where(squared > 0, squared, 1.0)
-    off = gap - np.clip(along, 0.0, 1.0)[..., None] * span
-    return np.hypot(off[..., 0], off[..., 1])
-
-
-def _crossings(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Tell which segments ``ab`` ``(n, 2)`` cross which ``cd`` ``(m, 2)`` within both."""
-    a, b = a[:, None], b[:, None]
-
-    def sides(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
-        span = end - start
-        off = _cross(span, points - start) / np.hypot(span[..., 0], span[..., 1])
-        return np.where(np.abs(off) <= _TOUCH_M, 0.0, np.sign(off))
-
-    across = sides(a, b, c) * sides(a, b, d) < 0
-    return across & (sides(c, d, a) * sides(c, d, b) < 0)
-
-
-def _meet(a: np.ndarray, b: np.ndarray) -> bool:
-    """Tell whether two outlines touch or cross."""
-    if a.ndim == b.ndim == 1:
-        apart = math.dist(a[:2], b[:2])
-        return bool(abs(a[2] - b[2]) - _TOUCH_M <= apart <= a[2] + b[2] + _TOUCH_M)
-    if a.ndim == 1:
-        a, b = b, a
-    ends = np.roll(a, -1, 0)
-    if b.ndim == 1:
-        nearest = _to_segments(b[None, :2], a, ends).min()
-        farthest = np.hypot(*(a - b[:2]).T).max()
-        return bool(nearest <= b[2] + _TOUCH_M and farthest >= b[2] - _TOUCH_M)
-    b_ends = np.roll(b, -1, 0)
-    near = min(_to_segments(a, b, b_ends).min(), _to_segments(b, a, ends).min())
-    return bool(near <= _TOUCH_M or _crossings(a, ends, b, b_ends).any())

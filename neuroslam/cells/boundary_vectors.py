@@ -1,0 +1,74 @@
+"""Boundary vectors: where an animal was, and the bearing and distance of a wall from there."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.geometry import TWO_PI
+
+
+class Wall(NamedTuple):
+    """Columns of the memory: anchor, bearing and distance of a wall from there, its variance.
+
+    And since when it is remembered, on the animal's clock.
+    """
+
+    x_m: Tensor
+    y_m: Tensor
+    bearing_rad: Tensor
+    distance_m: Tensor
+    variance_m2: Tensor
+    made_s: Tensor
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Bring angles into [-pi, pi)."""
+    return (angle + math.pi).remainder(TWO_PI) - math.pi
+
+
+def wall_innovation(
+    position_m: Tensor, distance_m: Tensor, bearing_rad: Tensor, wall: Wall
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Compare a wall with the memory of it.
+
+    .. math:: \nu = R - R_m - (x_m - x) \cdot \mathbf n, \qquad
+              \mathbf n = \frac{(\cos\gamma, \sin\gamma)}{\cos((\alpha - \alpha_m)/2)}, \quad
+              \gamma = \frac{\alpha + \alpha_m}{2}
+
+    The chord between two feet of perpendiculars is normal to the mean bearing: exactly for a
+    straight wall and for a circle, to second order for any other. (With the bearing of now in
+    place of the mean, a curved wall seems the farther the more it curves, and pulls.)
+
+    Args:
+        position_m: :math:`x`, ``(..., 2)``.
+        distance_m: :math:`R`, ``(...)``.
+        bearing_rad: :math:`\alpha` in the world, ``(...)``.
+        wall: :math:`x_m, \alpha_m, R_m`.
+
+    Returns:
+        :math:`\nu` in metres; :math:`\mathbf n`, ``(..., 2)``; the lever in metres, distance along
+        the wall between the two places, by which an error of bearing counts.
+    """
+    half = wrap(bearing_rad - wall.bearing_rad) / 2
+    middle = wall.bearing_rad + half
+    normal = torch.stack([middle.cos(), middle.sin()], dim=-1) / half.cos().unsqueeze(-1)
+    dx, dy = wall.x_m - position_m[..., 0], wall.y_m - position_m[..., 1]
+    nx, ny = normal.unbind(-1)
+    return distance_m - wall.distance_m - dx * nx - dy * ny, normal, dy * nx - dx * ny
+
+
+def unlikeness(walls: Tensor, position_m: Tensor, bearing_rad: Tensor, scale: Tensor) -> Tensor:
+    r"""Say how unlike remembered walls are to one that is looked at; below 1 it is the same.
+
+    .. math:: \frac{|x_m - x|^2}{s^2} + \frac{(\alpha_m - \alpha)^2}{a^2}
+
+    Args:
+        walls: Rows as in :class:`Wall`, ``(..., 5)``.
+        position_m: :math:`x`, ``(..., 2)``.
+        bearing_rad: :math:`\alpha`, ``(...)``.
+        scale: :math:`s` in metres, :math:`a` in radians.
+    """
+    away = (walls[..., :2] - position_m).square().sum(-1) / scale[0].square()
+    return away + (wrap(walls[..., 2] - bearing_rad) / scale[1]).square()

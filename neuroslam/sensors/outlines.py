@@ -1,0 +1,141 @@
+"""Outlines in the plane: what is checked of them, and what is inside, near or across them.
+
+An outline is ``(n, 2)`` vertices in metres, not repeating the first, or the three numbers
+``(x, y, radius)`` of a circle.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neuroslam.errors import SourceError
+from neuroslam.geometry import TWO_PI
+
+TOUCH_M = 1e-9
+"""Whoever is nearer to a wall than this stands at it, on the side that is free."""
+
+
+def bearings_of(directions: np.ndarray) -> np.ndarray:
+    """Angles of vectors ``(n, 2)``, in (-pi, pi]."""
+    angle = np.arctan2(directions[:, 1], directions[:, 0])
+    return np.where(angle <= -math.pi, math.pi, angle) + 0.0  # no negative zeros
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products of vectors in the plane, ``(..., 2)``."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def vertices_of(outline: np.ndarray) -> np.ndarray:
+    """Vertices of an outline, ``(n, 2)``; 180 of a circle."""
+    if outline.ndim == 2:
+        return outline
+    angle = TWO_PI * np.arange(180) / 180
+    return outline[:2] + outline[2] * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def checked_outline(values: ArrayLike, who: str) -> np.ndarray:
+    """Check an outline; polygons come back counter-clockwise.
+
+    Raises:
+        SourceError: If it has too few vertices, sides without length, or meets itself.
+    """
+    outline = np.array(values, dtype=np.float64)
+    if outline.shape != (3,) and (outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3):
+        raise SourceError(
+            f"{who} has shape {outline.shape}; expected (n, 2) vertices, at least 3, or the centre "
+            "and radius of a circle (3,)"
+        )
+    if not np.isfinite(outline).all():
+        raise SourceError(f"{who} has numbers that are not finite; expected metres")
+    if outline.ndim == 1:
+        if outline[2] <= 0:
+            raise SourceError(f"{who} has the radius {outline[2]:g} m; expected more than 0")
+        return outline
+    n, side = len(outline), np.roll(outline, -1, 0) - outline
+    short = np.flatnonzero(np.hypot(*side.T) <= TOUCH_M)
+    if len(short):
+        raise SourceError(
+            f"{who}: side {short[0]} has no length; expected vertices apart, the first not repeated"
+        )
+    ends = np.roll(outline, -1, 0)
+    over = crossings(outline, ends, outline, ends)
+    touch = to_segments(outline, outline, ends) <= TOUCH_M
+    at = np.arange(n)
+    touch[at, at] = touch[at, at - 1] = False  # a vertex is on the two sides that it joins
+    i, j = np.nonzero(over | touch)
+    if len(i):
+        raise SourceError(f"{who} meets itself at sides {i[0]} and {j[0]}; expected a simple one")
+    return outline if cross(outline, ends).sum() > 0 else outline[::-1].copy()
+
+
+def checked_walls(walls: Sequence[ArrayLike], name: str) -> np.ndarray:
+    """Check free-standing walls; they come back as ``(n, 2, 2)``.
+
+    Raises:
+        SourceError: If one is not two ends apart.
+    """
+    found = np.empty((len(walls), 2, 2))
+    for k, wall in enumerate(walls):
+        ends = np.asarray(wall, dtype=np.float64)
+        if ends.shape != (2, 2) or not np.isfinite(ends).all():
+            raise SourceError(
+                f"{name}: wall {k} has shape {ends.shape} or numbers that are not finite; expected "
+                "two ends (2, 2) in metres"
+            )
+        if math.dist(*ends.tolist()) <= TOUCH_M:
+            raise SourceError(f"{name}: wall {k} has no length; expected two ends apart")
+        found[k] = ends
+    return found
+
+
+def within(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """Tell which points ``(n, 2)`` are inside one outline: a ray to the right crosses it oddly."""
+    if outline.ndim == 1:
+        return np.hypot(*(points - outline[:2]).T) < outline[2]
+    (x0, y0), (x1, y1) = outline.T, np.roll(outline, -1, 0).T
+    x, y = points[:, :1], points[:, 1:]
+    lean = (x1 - x0) / np.where(y1 == y0, 1.0, y1 - y0)
+    crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * lean)
+    return np.logical_xor.reduce(crossed, axis=1)
+
+
+def to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Distance of points ``(n, 2)`` to segments ``(m, 2)``, ``(n, m)``."""
+    span, gap = ends - starts, points[:, None] - starts
+    squared = np.sum(span**2, axis=1)
+    along = np.sum(gap * span, axis=2) / np.where(squared > 0, squared, 1.0)
+    off = gap - np.clip(along, 0.0, 1.0)[..., None] * span
+    return np.hypot(off[..., 0], off[..., 1])
+
+
+def crossings(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Tell which segments ``ab`` ``(n, 2)`` cross which ``cd`` ``(m, 2)`` within both."""
+    a, b = a[:, None], b[:, None]
+
+    def sides(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
+        span = end - start
+        off = cross(span, points - start) / np.hypot(span[..., 0], span[..., 1])
+        return np.where(np.abs(off) <= TOUCH_M, 0.0, np.sign(off))
+
+    across = sides(a, b, c) * sides(a, b, d) < 0
+    return across & (sides(c, d, a) * sides(c, d, b) < 0)
+
+
+def meet(a: np.ndarray, b: np.ndarray) -> bool:
+    """Tell whether two outlines touch or cross."""
+    if a.ndim == b.ndim == 1:
+        apart = math.dist(a[:2], b[:2])
+        return bool(abs(a[2] - b[2]) - TOUCH_M <= apart <= a[2] + b[2] + TOUCH_M)
+    if a.ndim == 1:
+        a, b = b, a
+    ends = np.roll(a, -1, 0)
+    if b.ndim == 1:
+        nearest = to_segments(b[None, :2], a, ends).min()
+        farthest = np.hypot(*(a - b[:2]).T).max()
+        return bool(nearest <= b[2] + TOUCH_M and farthest >= b[2] - TOUCH_M)
+    b_ends = np.roll(b, -1, 0)
+    near = min(to_segments(a, b, b_ends).min(), to_segments(b, a, ends).min())
+    return bool(near <= TOUCH_M or crossings(a, ends, b, b_ends).any())
