@@ -298,13 +298,8 @@ def plot_encounters(
         ValueError: If there is no time.
     """
     _need("plot_encounters", stops)
-    columns = min(5, len(stops))
-    lines = -(-len(stops) // columns)
     with mpl.rc_context(STYLE):
-        figure = new_figure(2.5 * columns + 0.9, 2.75 * lines + 0.5, title)
-        axes = figure.subplots(lines, columns, squeeze=False)
-        for ax in axes.ravel()[len(stops) :]:
-            ax.set_axis_off()
+        figure, axes = _panels(len(stops), 5, (2.5, 2.75), (0.9, 0.5), title)
         for (name, stop), ax in zip(stops.items(), axes.ravel(), strict=False):
             where, active = positions_m[:stop], activity[:stop] > 0.0
             ax.plot(*where.T, color="#d5d5d5", lw=0.4, zorder=1)
@@ -332,13 +327,8 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
         ValueError: If there is no panel.
     """
     _need("plot_scores", panels)
-    columns = min(3, len(panels))
-    lines = -(-len(panels) // columns)
     with mpl.rc_context(STYLE):
-        figure = new_figure(3.7 * columns + 0.4, 3.1 * lines + 0.9, title)
-        axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
-        for ax in axes.ravel()[len(panels) :]:
-            ax.set_axis_off()
+        figure, axes = _panels(len(panels), 3, (3.7, 3.1), (0.4, 0.9), title, share=True)
         key = {}
         for (name, curves), ax in zip(panels.items(), axes.ravel(), strict=False):
             for label, (x, y, colour, dash, spread) in curves.items():
@@ -355,6 +345,25 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
         columns = len(key) if len(key) < 6 else 4
         figure.legend(handles=list(key.values()), loc="outside lower center", ncols=columns)
     return figure
+
+
+def _panels(
+    n: int,
+    most_columns: int,
+    panel_in: tuple[float, float],
+    around_in: tuple[float, float],
+    title: str,
+    share: bool = False,
+) -> tuple[Figure, np.ndarray]:
+    """Make a figure with ``n`` panels in rows; the places left over in the last row stay empty."""
+    columns = min(most_columns, n)
+    lines = -(-n // columns)
+    width, height = panel_in[0] * columns + around_in[0], panel_in[1] * lines + around_in[1]
+    figure = new_figure(width, height, title)
+    axes = figure.subplots(lines, columns, sharex=share, sharey=share, squeeze=False)
+    for ax in axes.ravel()[n:]:
+        ax.set_axis_off()
+    return figure, axes
 
 
 def _tidy(axes: np.ndarray) -> None:

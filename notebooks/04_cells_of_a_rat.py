@@ -87,7 +87,7 @@ axes.plot(time_s, to_wall, color=INK, label="distance to the wall (m)")
 axes.plot(time_s, activity, color=MAP, label="activity of the cells")
 axes.set(xlabel="time (s)", ylabel="metres; activity", ylim=(0, 0.8), xlim=(0, 4))
 axes.set_title("To a wall and back")
-axes.legend(loc="upper left", ncols=1)
+figure.legend(loc="outside lower center", ncols=4)
 plt.show()
 
 # %% [markdown]

@@ -319,6 +319,15 @@ def test_an_outline_is_found_again_wherever_it_was_put(turn):
     np.testing.assert_allclose(moved.moved(laid.turn_rad, laid.move_m).feet_m, feet, atol=1e-6)
 
 
+def test_a_stored_map_without_views_waits_for_the_merge_and_says_so(squares):
+    brain = brain_of("slrb")
+    brain.store(squares[0])
+    lives(brain, open_source("arena:square?minutes=0.5&noise=1&seed=9"))
+    (stored,) = brain.not_joined()
+    assert stored["reason"].endswith("neuroslam merge")
+    assert stored["experiences"] == squares[0].map.n
+
+
 def test_brains_with_other_cells_do_not_merge(squares):
     for over in ({"cells": "pose"}, {"place_cells": {"threshold_m": 0.1}}):
         other = brain_of("slrb", **over)

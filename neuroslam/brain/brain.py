@@ -365,7 +365,10 @@ class NavigationBrain(nn.Module):
                 "experiences": one.map.n,
                 "places_that_look_alike": alike,
                 "places_that_agree": agreed,
-                "reason": f"{alike} places looked like one of it, {agreed} at most agreed on how "
+                "reason": "maps without views are laid on each other when they are finished: "
+                "neuroslam merge"
+                if self.config.cells == "place"
+                else f"{alike} places looked like one of it, {agreed} at most agreed on how "
                 f"the maps lie; {needed} must",
             }
             for one, alike, agreed in zip(

@@ -37,9 +37,10 @@ _UNKNOWN_M2 = 1.0  # variance of a distance before it was measured
 class WallMemory(Running):
     """Remembered walls of an animal, and its belief about its own errors.
 
-    :func:`wall_innovation` has the geometry. The state is complete: all remembered walls
-    (``walls``, ``n_walls``), which of them are active (``active``), the covariance, the learnt
-    errors of speed and compass (``errors``), and the motion since the last look.
+    :func:`~neuroslam.cells.boundary_vectors.wall_innovation` has the geometry. The state is
+    complete: all remembered walls (``walls``, ``n_walls``), which of them are active
+    (``active``), the covariance, the learnt errors of speed and compass (``errors``), and the
+    motion since the last look.
 
     Args:
         config: Noise of motion and senses, what is one wall.
