@@ -27,3 +27,7 @@ class MapError(NeuroslamError, ValueError):
 
 class RunError(NeuroslamError, ValueError):
     """A run directory that cannot be written, resumed or read."""
+
+
+class SpaceError(NeuroslamError, ValueError):
+    """Vectors or positions that do not fit a semantic map: wrong dimension, NaN, unknown name."""

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
-from neuroslam.brain.checkpoint import FORMAT_VERSION, tensors_digest
+from neuroslam.brain.checkpoint import FORMAT_VERSION
+from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.inspection import inspect, verify

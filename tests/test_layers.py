@@ -8,9 +8,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 FLOW = [
-    "errors", "types", "geometry", "sections", "config", "storage", "population", "vision",
-    "sensors", "odometry", "view", "cells", "mapping", "brain",
-    "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "cell_panels",
+    "errors", "types", "geometry", "sections", "config", "semantic_sections",
+    "storage", "checked_files", "population", "vision",
+    "sensors", "odometry", "view", "cells", "spiking", "mapping", "brain",
+    "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "spike_drawing",
+    "semantic_drawing", "cell_panels",
     "merge_drawing", "recording", "run_files",
     "inspection", "export",
     "review", "runs", "merging", "demo",

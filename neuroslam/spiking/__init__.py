@@ -1,0 +1,1 @@
+"""Semantic maps in spikes: spatial semantic pointers, populations of neurons, SSP-SLAM."""

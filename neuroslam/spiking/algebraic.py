@@ -1,0 +1,156 @@
+"""The same path integrator and map in vectors alone: what the neurons approximate."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from neuroslam.population import Running
+from neuroslam.semantic_sections import PathIntegratorConfig, SemanticMapConfig
+from neuroslam.spiking.path_integrator import Packet, coupled
+from neuroslam.spiking.space import SSPSpace
+
+
+class AlgebraicIntegrator(Packet):
+    r"""Keeps a position as phases that the velocity turns.
+
+    .. math:: z_k \leftarrow z_k\, e^{i (a_k \cdot v\,\Delta t + \sigma \sqrt{\Delta t}\,\xi_k)}
+
+    State: ``phasor``, ``position_m``, and the generator of the noise.
+
+    Args:
+        space: Of the positions.
+        config: Noise, coupling, how fast corrections act.
+        time_step_s: Length of a step.
+        seed: Of the noise.
+        batch: Animals side by side; each has its own noise.
+
+    Example:
+        >>> from neuroslam.spiking.space import SSPSpace
+        >>> space = SSPSpace.hexagonal()
+        >>> walk = AlgebraicIntegrator(space, PathIntegratorConfig(), time_step_s=0.01)
+        >>> walk.start(torch.zeros(1, 2))
+        >>> for _ in range(100):
+        ...     z = walk(torch.tensor([[0.3, 0.1]]))
+        >>> [round(x, 3) for x in walk.position_m[0].tolist()]
+        [0.3, 0.1]
+    """
+
+    phasor: Tensor
+    generator_state: Tensor
+
+    def __init__(
+        self,
+        space: SSPSpace,
+        config: PathIntegratorConfig,
+        time_step_s: float,
+        seed: int = 0,
+        batch: int = 1,
+    ) -> None:
+        super().__init__(space, config, time_step_s, batch)
+        draw = torch.Generator().manual_seed(seed)
+        self.register_buffer("phasor", torch.zeros(batch, space.n_frequencies, 2))
+        self.register_buffer("generator_state", draw.get_state())
+        self._draw = draw
+
+    @property
+    def z(self) -> Tensor:
+        """Fourier coefficients, complex, ``(batch, n_frequencies)``."""
+        return torch.view_as_complex(self.phasor)
+
+    @property
+    def n_neurons(self) -> int:
+        """None."""
+        return 0
+
+    @torch.no_grad()
+    def start(self, position_m: Tensor) -> None:
+        """Put the phases where an animal is, ``(batch, dimension)``."""
+        z = self.space.encode_fourier(position_m.to(self.position_m))
+        self.phasor = torch.view_as_real(z).clone()
+        self._place(position_m)
+
+    def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
+        """Move on by one step; arguments as those of the neurons' integrator."""
+        c, dt = self.config, self.time_step_s
+        turn = (velocity_m_s * dt) @ self.space.wave_vectors.T
+        if c.phase_noise_rad > 0:
+            self._draw.set_state(self.generator_state)
+            noise = torch.randn(turn.shape, generator=self._draw).to(turn)
+            self.generator_state = self._draw.get_state()
+            turn = turn + c.phase_noise_rad * math.sqrt(dt) * noise
+        z = self.z
+        pull = coupled(z, pull, self.position_m, self.space, c)
+        if pull is not None:
+            z = z + pull * (1.0 - math.exp(-dt / c.input_tau_s))
+        z = z / z.abs().clamp_min(1e-6) * torch.polar(torch.ones_like(turn), turn)
+        self.phasor = torch.view_as_real(z)
+        return self.locate()
+
+
+class AlgebraicMap(Running):
+    r"""Learns which vector belongs to which key, as one matrix and by the delta rule.
+
+    .. math:: W \leftarrow W + \kappa\,\Delta t\,(v - W k)\, k^\top / |k|^2
+
+    State: ``weights``, ``(batch, n_value, n_key)``.
+
+    Args:
+        n_key: Length of keys.
+        n_value: Length of values.
+        config: Rate of learning.
+        time_step_s: Length of a step.
+        batch: Animals side by side.
+
+    Example:
+        >>> memory = AlgebraicMap(4, 3, SemanticMapConfig(), time_step_s=0.01)
+        >>> key, value = torch.eye(4)[:1], torch.tensor([[1.0, 2.0, 3.0]])
+        >>> for _ in range(100):
+        ...     recall = memory(key, value, torch.ones(1))
+        >>> memory.read(key).round(decimals=1).tolist()
+        [[[1.0, 2.0, 3.0]]]
+    """
+
+    weights: Tensor
+
+    def __init__(
+        self,
+        n_key: int,
+        n_value: int,
+        config: SemanticMapConfig,
+        time_step_s: float,
+        batch: int = 1,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.time_step_s = time_step_s
+        self.register_buffer("weights", torch.zeros(batch, n_value, n_key))
+
+    @property
+    def n_neurons(self) -> int:
+        """None."""
+        return 0
+
+    def forward(
+        self, key: Tensor, value: Tensor, seen: Tensor, plasticity: Tensor | None = None
+    ) -> Tensor:
+        """Recall a key's value and learn; arguments as those of the neurons' map."""
+        recall = (self.weights @ key.unsqueeze(-1)).squeeze(-1)
+        rate = seen * (1.0 - math.exp(-self.config.learning_rate_s * self.time_step_s))
+        rate = rate if plasticity is None else rate * plasticity
+        error = (value - recall) * rate.unsqueeze(-1)
+        unit = key / key.square().sum(-1, keepdim=True).clamp_min(1e-6)
+        self.weights = self.weights.baddbmm(error.unsqueeze(-1), unit.unsqueeze(-2))
+        return recall
+
+    @torch.no_grad()
+    def read(self, keys: Tensor) -> Tensor:
+        """Return what is recalled, ``(n, n_key)`` to ``(batch, n, n_value)``."""
+        return keys.to(self.weights) @ self.weights.mT
+
+    @torch.no_grad()
+    def write(self, keys: Tensor, values: Tensor) -> None:
+        """Make keys recall values, ``(n, n_key)`` and ``(n, n_value)``, of all animals."""
+        inverse = torch.linalg.pinv(keys.double()).to(self.weights)
+        weights = (inverse @ values.to(self.weights)).T
+        self.weights = weights.expand_as(self.weights).contiguous()

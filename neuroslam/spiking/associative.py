@@ -1,0 +1,198 @@
+"""The semantic map: an associative memory, in neurons, from what is seen to where it is."""
+
+import torch
+from torch import Tensor
+
+from neuroslam.population import Running
+from neuroslam.semantic_sections import NeuronConfig, SemanticMapConfig
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    Tuning,
+    lowpass,
+    rates,
+    sample_tuning,
+    solve_decoders,
+    synapse,
+)
+from neuroslam.spiking.learning import pes_step, voja_step
+
+_SOLVER_POINTS = 3000
+_TAU_RECALL_S = 0.005
+_TAU_ERROR_S = 0.05
+_TAU_TEACHER_S = 0.05
+_INHIBITION = 25.0  # of the error's neurons, where nothing is to be learnt
+
+
+class AssociativeMap(Running):
+    """Learns which vector belongs to which key: places of landmarks, by their pointers.
+
+    A population fires to keys; the weights with which it recalls learn from the error
+    (:func:`~neuroslam.spiking.learning.pes_step`), its encoders move to the keys that it meets
+    (:func:`~neuroslam.spiking.learning.voja_step`). The error is said by a population of its own,
+    which is silenced where nothing is to be learnt. What is recalled may pass through one more
+    (``relay`` in the config).
+
+    State: all of it, learnt weights of every animal among it, ``encoders`` ``(batch, neurons,
+    key)`` and ``decoders`` ``(batch, neurons, value)``.
+
+    Args:
+        n_key: Length of keys.
+        n_value: Length of values.
+        config: Size and rates of learning.
+        neurons: Their model.
+        time_step_s: Length of a step.
+        seed: Of the neurons.
+        batch: Animals side by side.
+        keys: Known in advance, ``(n, n_key)``: encoders begin there; ``None``: anywhere.
+
+    Example:
+        >>> key, place = torch.eye(8)[:1], torch.eye(8)[6:7]
+        >>> config = SemanticMapConfig(neurons=200, pes_rate=0.05)
+        >>> memory = AssociativeMap(8, 8, config, NeuronConfig(), time_step_s=1e-3)
+        >>> for _ in range(500):
+        ...     recall = memory(key, place, torch.ones(1))
+        >>> memory.read(key)[0].argmax(-1).item()
+        6
+    """
+
+    encoders: Tensor
+    decoders: Tensor
+    gain: Tensor
+    activity_hz: Tensor
+    recalled: Tensor
+    relayed: Tensor
+    taught: Tensor
+    rule: Tensor
+    relay_decoders: Tensor
+    error_decoders: Tensor
+
+    def __init__(
+        self,
+        n_key: int,
+        n_value: int,
+        config: SemanticMapConfig,
+        neurons: NeuronConfig,
+        time_step_s: float,
+        seed: int = 0,
+        batch: int = 1,
+        keys: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.time_step_s = time_step_s
+        draw = torch.Generator().manual_seed(seed)
+        n = config.neurons
+        near = None
+        if keys is not None:
+            near = keys[torch.arange(n) % len(keys)].unsqueeze(0).float()
+            near = near / near.norm(dim=-1, keepdim=True)
+        tuning = sample_tuning(1, n, n_key, neurons, draw, 1.0, near, config.intercept)
+        self.memory = NeuronArray(tuning, neurons, time_step_s, draw, batch)
+        self.register_buffer("gain", tuning.gain[0] / tuning.radius)
+        self.register_buffer("encoders", tuning.weights.expand(batch, -1, -1).contiguous())
+        self.register_buffer("decoders", torch.zeros(batch, n, n_value))
+        self.register_buffer("activity_hz", torch.zeros(batch, n))
+        for name in ("recalled", "relayed", "taught", "rule"):
+            self.register_buffer(name, torch.zeros(batch, n_value))
+        for name in ("relay", "error")[not config.relay :]:
+            tuning = sample_tuning(1, n, n_value, neurons, draw)
+            setattr(self, name, NeuronArray(tuning, neurons, time_step_s, draw, batch))
+            self.register_buffer(f"{name}_decoders", _identity(tuning, neurons, draw) / time_step_s)
+
+    def forward(
+        self,
+        key: Tensor,
+        value: Tensor,
+        seen: Tensor,
+        plasticity: Tensor | None = None,
+        voja: Tensor | None = None,
+    ) -> Tensor:
+        """Recall a key's value and learn the value that it has now, by one step.
+
+        Args:
+            key: ``(batch, n_key)``.
+            value: ``(batch, n_value)``.
+            seen: 1 where there is something to learn, else 0, ``(batch,)``.
+            plasticity: Share of the rate of learning, ``(batch,)``; ``None``: all of it.
+            voja: How much encoders learn, ``(batch,)``; ``None``: as ``seen``.
+
+        Returns:
+            What is recalled, filtered, ``(batch, n_value)``.
+        """
+        c, dt = self.config, self.time_step_s
+        missing = 1.0 - self.memory.bias - (self.encoders @ key.unsqueeze(-1)).squeeze(-1)
+        spikes = self.memory.fire((self.memory.charged * missing).unsqueeze(0))[0]
+        said = self.error_said(seen)
+        passed = self.recalled
+        if c.relay:
+            passed = self.relay(passed.unsqueeze(0))[0] @ self.relay_decoders[0]
+        decoded = torch.bmm(spikes.unsqueeze(1), self.decoders).squeeze(1) / dt
+        self.activity_hz = lowpass(self.activity_hz, spikes / dt, synapse(_TAU_RECALL_S, dt))
+        error = self.rule if plasticity is None else self.rule * plasticity.unsqueeze(-1)
+        if c.pes_rate > 0:
+            rate = c.pes_rate * dt / c.neurons
+            self.decoders = pes_step(self.decoders, error, self.activity_hz, rate)
+        if c.voja_rate > 0:
+            rate = c.voja_rate * (seen if voja is None else voja).unsqueeze(-1)
+            self.encoders = voja_step(self.encoders, self.gain, spikes, key, rate)
+        kept = synapse(_TAU_ERROR_S, dt)
+        self.relayed = lowpass(self.relayed, passed, kept)
+        self.recalled = lowpass(self.recalled, decoded, synapse(_TAU_RECALL_S, dt))
+        self.taught = lowpass(self.taught, value, synapse(_TAU_TEACHER_S, dt))
+        self.rule = lowpass(self.rule, said, kept)
+        return self.recalled
+
+    def error_said(self, seen: Tensor) -> Tensor:
+        """Step the error's neurons, ``(batch,)`` in, and return what they say, raw."""
+        current = self.error.currents((self.relayed - self.taught).unsqueeze(0))
+        missing = 1.0 - current + _INHIBITION * (1.0 - seen).unsqueeze(-1)
+        return self.error.fire(self.error.charged * missing)[0] @ self.error_decoders[0]
+
+    @property
+    def n_neurons(self) -> int:
+        """Of one animal, in all populations."""
+        parts = [self.memory, self.error] + ([self.relay] if self.config.relay else [])
+        return sum(part.n_neurons for part in parts)
+
+    @torch.no_grad()
+    def read(self, keys: Tensor) -> Tensor:
+        """Return what would be recalled at rest, nothing learnt or stepped.
+
+        Args:
+            keys: ``(n, n_key)``.
+
+        Returns:
+            ``(batch, n, n_value)``.
+        """
+        current = self.memory.bias + keys.to(self.encoders) @ self.encoders.mT
+        return rates(current, self.memory.config, self.time_step_s) @ self.decoders
+
+    @torch.no_grad()
+    def write(self, keys: Tensor, values: Tensor) -> None:
+        r"""Make keys recall values, and forget what was recalled before; of all animals.
+
+        .. math:: D = A^\top (A A^\top)^{-1} V
+
+        with the rates :math:`A` to the keys: the smallest weights that do it.
+
+        Args:
+            keys: ``(n, n_key)``.
+            values: ``(n, n_value)``.
+        """
+        current = self.memory.bias + keys.to(self.encoders) @ self.encoders.mT
+        a = rates(current, self.memory.config, self.time_step_s).double()
+        gram = a @ a.mT
+        ridge = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+        gram = gram + ridge * torch.eye(len(keys), dtype=gram.dtype, device=gram.device)
+        weights = a.mT @ torch.linalg.solve(gram, values.to(a).expand(len(a), -1, -1))
+        self.decoders = weights.to(self.decoders.dtype).contiguous()
+
+
+def _identity(tuning: Tuning, config: NeuronConfig, draw: torch.Generator) -> Tensor:
+    """Decoders of the represented vector itself, for vectors anywhere in the ball."""
+    dimensions = tuning.encoders.shape[-1]
+    points = torch.randn(1, _SOLVER_POINTS, dimensions, generator=draw)
+    share = torch.rand(1, _SOLVER_POINTS, 1, generator=draw) ** (1.0 / dimensions)
+    points = tuning.radius * share * points / points.norm(dim=-1, keepdim=True)
+    current = torch.baddbmm(tuning.bias.unsqueeze(1), points, tuning.weights.mT)
+    return solve_decoders(rates(current, config), points)

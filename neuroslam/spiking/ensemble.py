@@ -1,0 +1,233 @@
+"""Populations of neurons that say vectors: tuning, decoders, synapses (the NEF's principles)."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.population import Running
+from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.spiking.neurons import (
+    LIFState,
+    Membrane,
+    lif_rate,
+    lif_step,
+    resting,
+    stepped_lif,
+    stepped_lif_rate,
+)
+
+
+class Tuning(NamedTuple):
+    r"""What neurons respond to: :math:`J = \alpha\,e \cdot x / r + \beta`.
+
+    Attributes:
+        encoders: :math:`e`, unit vectors, ``(groups, neurons, dimensions)``.
+        gain: :math:`\alpha`, ``(groups, neurons)``.
+        bias: :math:`\beta`, the same shape.
+        radius: :math:`r`, largest length of what is represented.
+    """
+
+    encoders: Tensor
+    gain: Tensor
+    bias: Tensor
+    radius: float
+
+    @property
+    def weights(self) -> Tensor:
+        """Encoders with the gain and the radius in them."""
+        return self.encoders * (self.gain / self.radius).unsqueeze(-1)
+
+
+def sample_tuning(
+    groups: int,
+    neurons: int,
+    dimensions: int,
+    config: NeuronConfig,
+    generator: torch.Generator,
+    radius: float = 1.0,
+    encoders: Tensor | None = None,
+    intercept: float | None = None,
+) -> Tuning:
+    r"""Draw neurons whose rates at their encoders and whose intercepts are uniform.
+
+    .. math:: a(1) = r_{max}, \quad J(c) = 1 \quad \Rightarrow \quad
+              \alpha = \frac{J_{max} - 1}{1 - c}, \quad \beta = 1 - \alpha c
+
+    Args:
+        groups: Populations of the same size, side by side.
+        neurons: In each.
+        dimensions: Of what each represents.
+        config: Rates and intercepts.
+        generator: Of the draw.
+        radius: Largest length of what is represented.
+        encoders: Of unit length; ``None``: uniform on the sphere.
+        intercept: The same for all; ``None``: drawn from the config's range.
+
+    Example:
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> tuning = sample_tuning(1, 4, 2, NeuronConfig(max_rate_hz=(200, 200)), draw)
+        >>> strongest = tuning.gain + tuning.bias
+        >>> lif_rate(strongest).round().tolist()
+        [[200.0, 200.0, 200.0, 200.0]]
+    """
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(groups, neurons, generator=generator)
+
+    if encoders is None:
+        encoders = torch.randn(groups, neurons, dimensions, generator=generator)
+        encoders = encoders / encoders.norm(dim=-1, keepdim=True)
+    rate = uniform(*config.max_rate_hz)
+    c = uniform(*config.intercept) if intercept is None else torch.full_like(rate, intercept)
+    if config.model == "relu":
+        gain = rate / (1.0 - c)
+        return Tuning(encoders, gain, -gain * c, radius)
+    # The inverse of the rate, as a current above threshold.
+    excess = 1.0 / torch.expm1((1.0 / rate - config.tau_ref_s) / config.tau_rc_s)
+    gain = excess / (1.0 - c)
+    return Tuning(encoders, gain, 1.0 - gain * c, radius)
+
+
+def rates(current: Tensor, config: NeuronConfig, time_step_s: float = 1e-3) -> Tensor:
+    """Return the rates of neurons of a model under constant currents, in Hz."""
+    if config.model == "relu":
+        return current.clamp_min(0.0)
+    membrane = Membrane(config.tau_rc_s, config.tau_ref_s)
+    if config.model == "stepped_lif":
+        return stepped_lif_rate(current, membrane, time_step_s)
+    return lif_rate(current, membrane)
+
+
+def solve_decoders(activity: Tensor, targets: Tensor, noise: float = 0.1) -> Tensor:
+    r"""Solve for the weights that read a function out of rates, robust to noise in them.
+
+    .. math:: D = (A^\top A + n \sigma^2 I)^{-1} A^\top Y
+
+    with :math:`\sigma` the noise times the highest rate (NEF; Eliasmith and Anderson 2003).
+
+    Args:
+        activity: :math:`A`, rates at ``n`` points, ``(groups, n, neurons)``.
+        targets: :math:`Y`, ``(groups, n, outputs)``.
+        noise: As a share of the highest rate.
+
+    Returns:
+        ``(groups, neurons, outputs)``.
+
+    Example:
+        >>> rates = torch.rand(1, 50, 8, generator=torch.Generator().manual_seed(0))
+        >>> solve_decoders(rates, rates[..., :2], noise=1e-6).round(decimals=2)[0, :3].tolist()
+        [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]
+    """
+    a = activity.double()
+    gram = a.mT @ a
+    sigma = noise * a.amax((-2, -1))
+    ridge = (a.shape[-2] * sigma.square())[:, None] * torch.ones_like(gram[..., 0])
+    factor = torch.linalg.cholesky(gram + torch.diag_embed(ridge))
+    return torch.cholesky_solve(a.mT @ targets.double(), factor).to(activity.dtype)
+
+
+def synapse(tau_s: float, time_step_s: float) -> float:
+    r"""Return what a lowpass keeps over a step, :math:`e^{-\Delta t/\tau}`; 0 without one."""
+    return math.exp(-time_step_s / tau_s) if tau_s > 0 else 0.0
+
+
+def lowpass(filtered: Tensor, value: Tensor, kept: float) -> Tensor:
+    r"""Filter a value, :math:`y \leftarrow a y + (1 - a) u` (Eq. 10, zero-order hold)."""
+    return torch.lerp(value, filtered, kept)
+
+
+class NeuronArray(Running):
+    """Populations of the same size, side by side: currents in, spikes out.
+
+    :func:`neuroslam.spiking.neurons.lif_step` has the mathematics. Groups lead and animals come
+    second, so that one batched matrix product serves all of them. State: ``weights`` (encoders with
+    gain), ``bias``, and what each neuron carries, ``deficit`` and ``asleep``.
+
+    Args:
+        tuning: What the neurons respond to.
+        config: Their model.
+        time_step_s: Length of a step.
+        generator: Of the voltages at the start.
+        batch: Animals side by side.
+
+    Example:
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> tuning = sample_tuning(1, 100, 2, NeuronConfig(), draw)
+        >>> neurons = NeuronArray(tuning, NeuronConfig(), 1e-3, draw)
+        >>> neurons(torch.ones(1, 1, 2)).shape
+        torch.Size([1, 1, 100])
+    """
+
+    weights: Tensor
+    bias: Tensor
+    deficit: Tensor
+    asleep: Tensor
+
+    def __init__(
+        self,
+        tuning: Tuning,
+        config: NeuronConfig,
+        time_step_s: float,
+        generator: torch.Generator,
+        batch: int = 1,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.time_step_s = time_step_s
+        self.membrane = Membrane(config.tau_rc_s, config.tau_ref_s)
+        self.register_buffer("weights", tuning.weights)
+        self.register_buffer("bias", tuning.bias)
+        groups, neurons = tuning.bias.shape
+        start = torch.rand(groups, 1, neurons, generator=generator).expand(-1, batch, -1)
+        state = resting(start.contiguous())
+        self.register_buffer("deficit", state.deficit)
+        self.register_buffer("asleep", state.asleep)
+
+    @property
+    def charged(self) -> float:
+        """Share of the way to its current that a voltage goes in a step."""
+        return 1.0 - self.membrane.keeps(self.time_step_s)
+
+    @property
+    def n_neurons(self) -> int:
+        """In all groups together, of one animal."""
+        return self.bias.numel()
+
+    def currents(self, x: Tensor) -> Tensor:
+        """Return the currents that vectors cause, ``(groups, points, dimensions)`` in."""
+        return torch.baddbmm(self.bias.unsqueeze(1), x, self.weights.mT)
+
+    def rates(self, x: Tensor) -> Tensor:
+        """Return the rates under constant input, Hz; ``(groups, points, neurons)``."""
+        return rates(self.currents(x), self.config, self.time_step_s)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Step with vectors as input, ``(groups, batch, dimensions)``."""
+        share = self.charged
+        rest = (share * (1.0 - self.bias)).unsqueeze(1)
+        return self.fire(torch.baddbmm(rest, x, self.weights.mT, alpha=-share))
+
+    def fire(self, drive: Tensor) -> Tensor:
+        """Step with currents as input.
+
+        Args:
+            drive: One minus the current, times ``charged``, ``(groups, batch, neurons)``.
+
+        Returns:
+            Spikes in this step, 0 or 1; of rates, how many are to be expected. Same shape.
+        """
+        model = self.config.model
+        if model in ("lif_rate", "relu"):
+            return rates(1.0 - drive / self.charged, self.config) * self.time_step_s
+        step = lif_step if model == "lif" else stepped_lif
+        state = LIFState(self.deficit, self.asleep)
+        state, fired = step(state, drive, self.membrane, self.time_step_s)
+        self.deficit, self.asleep = state
+        return fired
+
+    def silence(self) -> None:
+        """Put all neurons to rest, at their thresholds' distance 1."""
+        self.deficit = torch.ones_like(self.deficit)
+        self.asleep = torch.zeros_like(self.asleep)

@@ -1,0 +1,141 @@
+"""Neuron models: leaky integrate-and-fire, its rates, and the same on a chip."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import leaky_relu, threshold
+
+LEAST_EXCESS = 1e-9
+"""Current above threshold below which a rate is that of this much; keeps its logarithm finite."""
+
+
+class LIFState(NamedTuple):
+    """What a neuron carries from one step to the next.
+
+    Attributes:
+        deficit: Threshold minus voltage, in (0, 1].
+        asleep: Steps until it wakes, with a share of a step as that of the charge which the step
+            will not bring; 0 if it is awake.
+    """
+
+    deficit: Tensor
+    asleep: Tensor
+
+
+class Membrane(NamedTuple):
+    """Constants of a membrane.
+
+    Attributes:
+        tau_rc_s: Time constant of the leak.
+        tau_ref_s: Refractory time after a spike.
+    """
+
+    tau_rc_s: float = 0.02
+    tau_ref_s: float = 0.002
+
+    def keeps(self, time_step_s: float) -> float:
+        """Share of a voltage that a step leaves."""
+        return math.exp(-time_step_s / self.tau_rc_s)
+
+
+def resting(voltage: Tensor) -> LIFState:
+    """Return the state of neurons that are not refractory, at voltages in [0, 1)."""
+    return LIFState(1.0 - voltage, torch.zeros_like(voltage))
+
+
+def lif_step(
+    state: LIFState, drive: Tensor, membrane: Membrane, time_step_s: float
+) -> tuple[LIFState, Tensor]:
+    r"""Advance leaky integrate-and-fire neurons by one step; a spike falls at its exact time.
+
+    .. math:: v \leftarrow v + (J - v)(1 - e^{-\delta/\tau_{rc}}), \qquad
+              t_s = \Delta t + \tau_{rc} \log\Bigl(1 - \frac{v-1}{J-1}\Bigr) \text{ if } v > 1
+
+    :math:`\delta` is the part of the step in which a neuron is not refractory; after a spike it is,
+    until :math:`t_s + \tau_{ref}` (the conventions of Nengo).
+
+    No exponential or logarithm is left to be taken. A refractory voltage is zero, so what it has
+    gained when it wakes is a share :math:`(1 - e^{-\delta/\tau}) / (1 - e^{-\Delta t/\tau})` of
+    what a whole step brings; and as :math:`e^{-(\Delta t - t_s)/\tau} = 1 - (v-1)/(J-1)`, that share
+    follows from the overshoot by a multiplication.
+
+    Args:
+        state: Of the step before.
+        drive: :math:`(1 - J)(1 - e^{-\Delta t/\tau_{rc}})`, any shape.
+        membrane: Time constants.
+        time_step_s: Length of the step.
+
+    Returns:
+        The state after the step, and the spikes, 0 or 1.
+
+    Example:
+        >>> state, current = resting(torch.zeros(1)), torch.full((1,), 2.0)
+        >>> drive = (1.0 - current) * (1.0 - Membrane().keeps(1e-3))
+        >>> spikes = 0
+        >>> for _ in range(1000):
+        ...     state, fired = lif_step(state, drive, Membrane(), 1e-3)
+        ...     spikes += int(fired)
+        >>> spikes, round(lif_rate(current).item())
+        (63, 63)
+    """
+    deficit, asleep = state
+    c, pause = membrane.keeps(time_step_s), membrane.tau_ref_s / time_step_s
+    whole = math.floor(pause + 1e-9)
+    part = math.exp((pause - whole) * time_step_s / membrane.tau_rc_s)
+    one = torch.ones((), dtype=drive.dtype, device=drive.device)
+    charged = torch.add(drive, deficit, alpha=c)
+    deficit = torch.lerp(charged, one, asleep.clamp(0.0, 1.0))
+    # Arithmetic on numbers instead of a choice by booleans, which is ten times slower.
+    fired = torch.lt(deficit, 0.0, out=torch.empty_like(deficit))
+    share = torch.addcdiv(one * (1.0 - part) / (1.0 - c), deficit, drive, value=part)
+    if part > 1.0 + 1e-9:
+        share = leaky_relu(share, c)  # it wakes a step later, with the time of this one
+    pause = share.clamp_(-1.0, 1.0).neg_().add_(float(whole))
+    asleep = asleep.sub(1.0).clamp_min_(0.0).addcmul_(fired, pause)
+    return LIFState(threshold(deficit, 0.0, 1.0).clamp_max_(1.0), asleep), fired
+
+
+def lif_rate(current: Tensor, membrane: Membrane = Membrane()) -> Tensor:  # noqa: B008 - immutable
+    r"""Return the rate at which a neuron fires under a constant current, in Hz.
+
+    .. math:: a(J) = \frac{1}{\tau_{ref} + \tau_{rc} \log(1 + 1/(J - 1))}, \quad J > 1
+
+    Example:
+        >>> lif_rate(torch.tensor([0.5, 2.0])).round().tolist()
+        [0.0, 63.0]
+    """
+    excess = (current - 1.0).clamp_min(LEAST_EXCESS)
+    rate = 1.0 / (membrane.tau_ref_s + membrane.tau_rc_s * torch.log1p(1.0 / excess))
+    return torch.where(current > 1.0, rate, 0.0)
+
+
+def stepped_lif(
+    state: LIFState, drive: Tensor, membrane: Membrane, time_step_s: float
+) -> tuple[LIFState, Tensor]:
+    """Advance neurons of a chip that knows no time between its steps.
+
+    A voltage is reset at the end of a step, whenever in it the threshold was crossed, and the pause
+    is a whole number of steps (the discretised neurons of Loihi; Davies et al. 2018). Arguments and
+    returns are those of :func:`lif_step`.
+    """
+    deficit, asleep = state
+    pause = round(membrane.tau_ref_s / time_step_s)
+    charged = torch.add(drive, deficit, alpha=membrane.keeps(time_step_s))
+    deficit = torch.lerp(charged, torch.ones_like(deficit), asleep.clamp(0.0, 1.0))
+    fired = torch.lt(deficit, 0.0, out=torch.empty_like(deficit))
+    asleep = asleep.sub(1.0).clamp_min_(0.0).add_(fired, alpha=float(pause))
+    return LIFState(threshold(deficit, 0.0, 1.0).clamp_max_(1.0), asleep), fired
+
+
+def stepped_lif_rate(current: Tensor, membrane: Membrane, time_step_s: float) -> Tensor:
+    r"""Return the rate of :func:`stepped_lif` neurons, in Hz: one over a whole number of steps.
+
+    .. math:: a(J) = \frac{1}{\Delta t\,(\lceil \tau_{ref}/\Delta t \rfloor +
+              \lfloor \tau_{rc} \log(1 + 1/(J-1)) / \Delta t \rfloor + 1)}
+    """
+    excess = (current - 1.0).clamp_min(LEAST_EXCESS)
+    rise = torch.log1p(1.0 / excess) * (membrane.tau_rc_s / time_step_s)
+    steps = round(membrane.tau_ref_s / time_step_s) + rise.floor() + 1.0
+    return torch.where(current > 1.0, 1.0 / (time_step_s * steps), 0.0)

@@ -1,0 +1,278 @@
+"""Path integration by velocity-controlled oscillators, each a population of neurons."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from neuroslam.errors import SpaceError
+from neuroslam.population import Running
+from neuroslam.semantic_sections import NeuronConfig, PathIntegratorConfig
+from neuroslam.spiking.decoding import PositionDecoder
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    lowpass,
+    sample_tuning,
+    solve_decoders,
+    synapse,
+)
+from neuroslam.spiking.space import SSPSpace
+
+_SOLVER_POINTS = 2500
+_RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
+_REREAD_STEPS = 100  # between two looks at the whole space for where the packet is
+_CLEARLY_BETTER = 0.05  # in similarity, where a packet elsewhere is believed
+
+
+def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilise: float) -> Tensor:
+    r"""Return what an oscillator tells itself, through a synapse, to go round.
+
+    .. math:: z \leftarrow z + \tau\Bigl(i \omega z + \lambda \frac{1 - r^2}{r} z\Bigr)
+
+    (SSP-SLAM, Eq. 19, by the NEF's third principle).
+
+    Args:
+        point: Real and imaginary part of :math:`z`, ``(..., 2)``.
+        frequency: :math:`\omega`, rad/s, ``(...)``.
+        tau_s: Of the synapse.
+        stabilise: :math:`\lambda`; 0: an oscillator without a preferred amplitude.
+    """
+    r = point.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    turned = torch.stack([-point[..., 1], point[..., 0]], dim=-1)
+    pull = stabilise * (1.0 - r.square()) / r * point
+    return point + tau_s * (frequency.unsqueeze(-1) * turned + pull)
+
+
+def module_pull(z: Tensor, modules: Tensor) -> Tensor:
+    r"""Return by how much the phases of each module should turn for their sum to be zero.
+
+    The waves of a module close, :math:`\sum_j a_j = 0`, so their phases sum to zero wherever the
+    animal is. Each takes its share of what is missing.
+
+    Args:
+        z: Fourier coefficients, complex, ``(..., n_frequencies)``.
+        modules: Frequencies of each module, ``(n_modules, n)``.
+
+    Returns:
+        Turns in rad, ``(..., n_frequencies)``.
+
+    Example:
+        >>> z = torch.exp(1j * torch.tensor([0.3, 0.1, 0.2]))
+        >>> (10 * module_pull(z, torch.arange(3)[None])).round().tolist()
+        [-2.0, -2.0, -2.0]
+    """
+    rest = z[..., modules].prod(-1).angle() / modules.shape[-1]
+    turn = torch.zeros(z.shape, dtype=rest.dtype, device=z.device)
+    turn[..., modules] = -rest.unsqueeze(-1).expand(*rest.shape, modules.shape[-1])
+    return turn
+
+
+def coupled(
+    z: Tensor,
+    pull: Tensor | None,
+    position_m: Tensor,
+    space: SSPSpace,
+    config: PathIntegratorConfig,
+) -> Tensor | None:
+    """Add to a correction the pull of the oscillators on each other.
+
+    Args:
+        z: Fourier coefficients, complex, ``(batch, n_frequencies)``.
+        pull: Of the map, the same shape, or ``None``.
+        position_m: Where they agree that the animal is, ``(batch, dimension)``.
+        space: Their waves.
+        config: Kind and gain of the coupling.
+    """
+    if config.coupling == "none" or config.coupling_gain == 0:
+        return pull
+    if config.coupling == "manifold":
+        inner = space.encode_fourier(position_m) - z
+    else:
+        turn = module_pull(z, space.grid_modules)
+        inner = torch.polar(torch.ones_like(turn), turn) * z - z
+    inner = config.coupling_gain * inner
+    return inner if pull is None else pull + inner
+
+
+class Packet(Running):
+    """What both kinds of path integrator share: where the packet of their phases is.
+
+    State: ``position_m`` ``(batch, dimension)``, ``age`` in steps, and the space's parameters.
+
+    Args:
+        space: Of the positions.
+        config: Coupling.
+        time_step_s: Length of a step.
+        batch: Animals side by side.
+    """
+
+    position_m: Tensor
+    age: Tensor
+
+    def __init__(
+        self, space: SSPSpace, config: PathIntegratorConfig, time_step_s: float, batch: int
+    ) -> None:
+        super().__init__()
+        if config.coupling == "modules" and space.grid_modules is None:
+            raise SpaceError(
+                "PathIntegrator: coupling within modules needs a space of modules; "
+                "take a hexagonal space, or coupling 'manifold'"
+            )
+        self.space, self.config, self.time_step_s = space, config, time_step_s
+        self.decoder = PositionDecoder(space)
+        self.register_buffer("position_m", torch.zeros(batch, space.dimension))
+        self.register_buffer("age", torch.zeros((), dtype=torch.long))
+
+    def _place(self, position_m: Tensor) -> None:
+        self.position_m = position_m.detach().to(self.position_m).clone()
+        self.age = torch.zeros_like(self.age)
+
+    def locate(self) -> Tensor:
+        """Follow the packet to where it is now, and return its Fourier coefficients.
+
+        Now and then the whole space is searched, so that a packet that jumped is found.
+        """
+        z = self.z
+        position = self.decoder.track(z, self.position_m)
+        self.age = self.age + 1
+        if int(self.age) % _REREAD_STEPS == 0:
+            best = self.decoder(z)
+            here = self.decoder.similarity(z, position)
+            jumped = best.similarity > here + _CLEARLY_BETTER
+            position = torch.where(jumped.unsqueeze(-1), best.position_m, position)
+        self.position_m = position
+        return z
+
+
+class PathIntegrator(Packet):
+    """Keeps a position as phases of oscillators, whose rates the velocity sets.
+
+    :func:`oscillator_dynamics` has the mathematics. Each oscillator is a population of neurons for
+    three numbers: a point of the unit circle and its rate, as a share of the rate at the highest
+    speed. Decoders are solved for points near the circle, where oscillators live.
+
+    State: the neurons' (``neurons``), and ``recurrent``, ``external``, ``output``,
+    ``position_m``; parameters of the space are its own and part of the state as well.
+
+    Args:
+        space: Of the positions.
+        config: Neurons, synapses, coupling.
+        neurons: Their model.
+        time_step_s: Length of a step.
+        seed: Of the neurons.
+        batch: Animals side by side; they have the same network.
+
+    Example:
+        >>> from neuroslam.spiking.space import SSPSpace
+        >>> space = SSPSpace.hexagonal(n_rotations=2, n_scales=2)
+        >>> config = PathIntegratorConfig(neurons=100)
+        >>> walk = PathIntegrator(space, config, NeuronConfig(), time_step_s=1e-3)
+        >>> walk.start(torch.zeros(1, 2))
+        >>> for _ in range(200):
+        ...     z = walk(torch.tensor([[0.3, 0.0]]))
+        >>> bool((walk.position_m - torch.tensor([[0.06, 0.0]])).norm() < 0.02)
+        True
+    """
+
+    recurrent: Tensor
+    external: Tensor
+    output: Tensor
+    fastest_rad_s: Tensor
+    decoders: Tensor
+
+    def __init__(
+        self,
+        space: SSPSpace,
+        config: PathIntegratorConfig,
+        neurons: NeuronConfig,
+        time_step_s: float,
+        seed: int = 0,
+        batch: int = 1,
+    ) -> None:
+        super().__init__(space, config, time_step_s, batch)
+        draw = torch.Generator().manual_seed(seed)
+        k = space.n_frequencies
+        tuning = sample_tuning(k, config.neurons, 3, neurons, draw, radius=_RADIUS)
+        self.neurons = NeuronArray(tuning, neurons, time_step_s, draw, batch)
+        for name in ("recurrent", "external", "output"):
+            self.register_buffer(name, torch.zeros(k, batch, 2))
+        # Rates that the decoders are solved for; they stay if the space is trained.
+        fastest = space.wave_vectors.detach().norm(dim=-1) * config.max_speed_m_s
+        self.register_buffer("fastest_rad_s", fastest)
+        self.register_buffer("decoders", self._solve(draw))
+
+    @property
+    def n_neurons(self) -> int:
+        """In all oscillators of one animal."""
+        return self.neurons.n_neurons
+
+    def _solve(self, draw: torch.Generator) -> Tensor:
+        """Decoders of what comes back and of what is read out, ``(groups, neurons, 4)``.
+
+        In units of spikes a step, so that they take what the neurons give.
+        """
+        c, k = self.config, self.space.n_frequencies
+        low, high = c.amplitude_range
+
+        def uniform(a: float, b: float) -> Tensor:
+            return a + (b - a) * torch.rand(k, _SOLVER_POINTS, generator=draw)
+
+        # Uniform over the ring's area, not over its radius.
+        r, angle, share = uniform(low**2, high**2).sqrt(), uniform(0, 2 * math.pi), uniform(-1, 1)
+        point = torch.stack([r * angle.cos(), r * angle.sin()], dim=-1)
+        rates = self.neurons.rates(torch.cat([point, share.unsqueeze(-1)], dim=-1))
+        omega = share * self.fastest_rad_s.unsqueeze(-1)
+        back = oscillator_dynamics(point, omega, c.tau_s, c.stabilise)
+        targets = torch.cat([back, point], dim=-1)
+        return solve_decoders(rates, targets, c.decoder_noise) / self.time_step_s
+
+    @property
+    def z(self) -> Tensor:
+        """Fourier coefficients of what is read out, complex, ``(batch, n_frequencies)``."""
+        return torch.view_as_complex(self.output.transpose(0, 1).contiguous())
+
+    @torch.no_grad()
+    def start(self, position_m: Tensor) -> None:
+        """Put the oscillators where an animal is, ``(batch, dimension)``.
+
+        The neurons' voltages are left as they are; they settle within a few milliseconds.
+        """
+        z = self.space.encode_fourier(position_m.to(self.output))
+        point = torch.view_as_real(z).transpose(0, 1).contiguous()
+        self.recurrent, self.output = point, point.clone()
+        self.external = torch.zeros_like(point)
+        self._place(position_m)
+
+    def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
+        r"""Move on by one step.
+
+        Args:
+            velocity_m_s: ``(batch, dimension)``.
+            pull: Correction :math:`u`, complex, ``(batch, n_frequencies)``: acts like
+                :math:`\dot z = u / \tau_{in}`.
+
+        Returns:
+            Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.
+        """
+        waves = self.space.wave_vectors
+        share = (velocity_m_s @ (waves / self.fastest_rad_s.unsqueeze(-1)).T).clamp(-1.0, 1.0)
+        pull = coupled(self.z, pull, self.position_m, self.space, self.config)
+        parts = None if pull is None else torch.view_as_real(pull).transpose(0, 1)
+        self.drive(share.T, parts)
+        return self.locate()
+
+    def drive(self, share: Tensor, pull: Tensor | None) -> None:
+        """Move the oscillators on by one step, in their own terms.
+
+        Args:
+            share: Rate of each oscillator over its highest, ``(n_frequencies, batch)``.
+            pull: ``(n_frequencies, batch, 2)``, or ``None``.
+        """
+        c, dt = self.config, self.time_step_s
+        point = self.recurrent + self.external
+        fired = self.neurons(torch.cat([point, share.unsqueeze(-1)], dim=-1))
+        decoded = torch.bmm(fired, self.decoders)
+        self.recurrent = lowpass(self.recurrent, decoded[..., :2], synapse(c.tau_s, dt))
+        kept = synapse(c.input_tau_s, dt)
+        self.external = kept * self.external if pull is None else lowpass(self.external, pull, kept)
+        self.output = lowpass(self.output, decoded[..., 2:], synapse(c.output_tau_s, dt))

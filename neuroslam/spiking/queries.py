@@ -1,0 +1,167 @@
+"""Questions to a semantic map: where is it, what is there, how far, and all of it in one vector."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroslam.errors import SpaceError
+from neuroslam.spiking.decoding import PositionDecoder
+from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.space import SSPSpace
+
+_LEAST_STRENGTH = 0.4  # of what is left, in which one more place is looked for
+_MOST_PLACES = 50
+_REFINEMENTS = 8
+
+
+class Places(NamedTuple):
+    """Places that a vector holds.
+
+    Attributes:
+        position_m: ``(n, dimension)``, the clearest first.
+        strength: How much of each there is; 1 for a whole one, ``(n,)``.
+    """
+
+    position_m: Tensor
+    strength: Tensor
+
+
+def places_in(space: SSPSpace, z: Tensor, least: float = _LEAST_STRENGTH) -> Places:
+    r"""Find the places whose SSPs add up to a vector.
+
+    One place after the other is taken out of it; all are moved together, so that neighbours do not
+    pull each other,
+
+    .. math:: \min_{x_i} \Bigl\lVert z - \sum_i c_i e^{i a \cdot x_i} \Bigr\rVert^2
+
+    Args:
+        space: Of the positions.
+        z: Fourier coefficients, complex, ``(n_frequencies,)``.
+        least: Strength from which on something is a place.
+
+    Example:
+        >>> space = SSPSpace.hexagonal()
+        >>> at = torch.tensor([[0.5, 0.2], [-0.3, 0.6]])
+        >>> found = places_in(space, space.encode_fourier(at).sum(0))
+        >>> sorted([round(x, 2), round(y, 2)] for x, y in found.position_m.tolist())
+        [[-0.3, 0.6], [0.5, 0.2]]
+    """
+    decoder = PositionDecoder(space)
+    found = z.real.new_zeros(0, space.dimension)
+    strength = z.real.new_zeros(0)
+    rest = z
+    for _ in range(_MOST_PLACES):
+        best = decoder(rest.unsqueeze(0))
+        if float(best.similarity) < least:
+            break
+        found, strength = _together(space, z, torch.cat([found, best.position_m]))
+        rest = z - strength.to(z.dtype) @ space.encode_fourier(found)
+    keep = strength >= least
+    found, strength = found[keep], strength[keep]
+    order = strength.argsort(descending=True)
+    return Places(found[order], strength[order])
+
+
+def _together(space: SSPSpace, z: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Move places and set their strengths by Gauss-Newton, so that they add up to a vector."""
+    waves = space.wave_vectors.detach()
+    low, high = space.bounds_m.T.to(at)
+    target = torch.cat([z.real, z.imag])
+    for _ in range(_REFINEMENTS):
+        phi = space.encode_fourier(at).detach()
+        basis = torch.cat([phi.real, phi.imag], dim=-1)
+        strength = torch.linalg.lstsq(basis.T, target.unsqueeze(-1)).solution.squeeze(-1)
+        slope = 1j * waves.T * phi.unsqueeze(-2) * strength[:, None, None]
+        slope = torch.cat([slope.real, slope.imag], dim=-1).flatten(0, 1)
+        both = torch.cat([basis, slope])
+        gram = both @ both.T
+        gram = gram + 1e-3 * gram.diagonal().mean() * torch.eye(len(both), dtype=gram.dtype)
+        step = torch.linalg.solve(gram, both @ (target - strength @ basis))
+        at = at + step[len(at) :].reshape(at.shape)
+        at = torch.minimum(torch.maximum(at, low), high)
+    return at, strength
+
+
+def recall(slam: SSPSLAM, key: Tensor, animal: int = 0) -> Tensor:
+    """Return what a pointer recalls, as Fourier coefficients, complex, ``(n_frequencies,)``.
+
+    Args:
+        slam: With its map.
+        key: Of a landmark, or of several together, ``(n_features,)``; its length does not matter
+            where it is of one. Sums of pointers recall sums of places.
+        animal: Of a batch.
+    """
+    if key.shape != (slam.space.n_features,):
+        raise SpaceError(
+            f"recall: a pointer of shape {tuple(key.shape)}, the map has {slam.space.n_features} "
+            "features; make it with the map's vocabulary"
+        )
+    return slam.space.to_fourier(slam.map.read(key.unsqueeze(0))[animal, 0])
+
+
+def where(slam: SSPSLAM, key: Tensor, animal: int = 0) -> Places:
+    """Return where the landmarks are whose pointers a key holds; see :func:`recall`."""
+    return places_in(slam.space, recall(slam, key, animal))
+
+
+def what(
+    slam: SSPSLAM, low_m: Sequence[float], high_m: Sequence[float], animal: int = 0
+) -> dict[str, float]:
+    r"""Return how much of each landmark lies in a box; about 1 inside, 0.5 on its edge, 0 outside.
+
+    The box's vector, :math:`R = \text{mean}_{x \in D}\,\phi(x)`, is the key of the map from places
+    to pointers. Inside, :math:`\phi \cdot R` is :math:`\lVert R \rVert^2` on average, whatever the
+    size of the box, so that is what an answer is measured by.
+
+    Args:
+        slam: Whose map of places learns (``places`` in its config).
+        low_m: Lower corner.
+        high_m: Upper corner.
+        animal: Of a batch.
+
+    Raises:
+        SpaceError: If it has no such map, or the box is not one.
+    """
+    if slam.places is None:
+        raise SpaceError("what: this map does not learn what is at places; set places = true")
+    box = torch.tensor([list(low_m), list(high_m)]).to(slam.pointers)
+    if box.shape != (2, slam.space.dimension) or not bool((box[0] <= box[1]).all()):
+        raise SpaceError(
+            f"what: a box from {list(low_m)} to {list(high_m)}, expected a lower and an upper "
+            f"corner of {slam.space.dimension} numbers each"
+        )
+    vector = slam.space.from_fourier(slam.space.region_fourier(box[0], box[1])).detach()
+    size = vector.norm()
+    said = slam.places.read((vector / size).unsqueeze(0))[animal, 0]
+    amounts = slam.pointers @ said / slam.pointers.square().sum(-1) / size
+    return dict(zip(slam.names, amounts.tolist(), strict=True))
+
+
+def vectors_to(slam: SSPSLAM, z: Tensor, animal: int = 0) -> Tensor:
+    r"""Return the vectors to all landmarks, as Fourier coefficients, complex.
+
+    .. math:: \hat\phi(x_i - x) = \hat\phi(x)^{-1} \circledast \hat\phi(x_i)
+
+    Args:
+        slam: With its map.
+        z: Where the animal is, complex, ``(..., n_frequencies)``.
+        animal: Of a batch.
+
+    Returns:
+        ``(..., landmarks, n_frequencies)``.
+    """
+    known = slam.space.to_fourier(slam.map.read(slam.pointers)[animal])
+    return z.unsqueeze(-2).conj() * known
+
+
+def whole_map(slam: SSPSLAM, animal: int = 0) -> Tensor:
+    r"""Return all landmarks in one vector, :math:`\sum_i \phi(x_i) \circledast B_i`.
+
+    Returns:
+        ``(n_features,)``; unbind a pointer from it and it is where that landmark is.
+    """
+    places = torch.fft.rfft(slam.map.read(slam.pointers)[animal])
+    pointers = torch.fft.rfft(slam.pointers)
+    return torch.fft.irfft((places * pointers).sum(0), n=slam.space.n_features)

@@ -1,0 +1,375 @@
+"""SSP-SLAM: oscillators keep the position, a map of landmarks learns places and corrects them."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuroslam.errors import SpaceError
+from neuroslam.population import Running
+from neuroslam.semantic_sections import NeuronConfig, SSPSLAMConfig
+from neuroslam.sensors.landmarks import LandmarkView
+from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
+from neuroslam.spiking.associative import AssociativeMap
+from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, region_vectors
+from neuroslam.spiking.binding import SpikingBinding
+from neuroslam.spiking.path_integrator import PathIntegrator
+from neuroslam.spiking.populations import VectorPopulation
+from neuroslam.spiking.space import SSPSpace
+
+_CHUNK = 200  # steps whose inputs are prepared at once
+_GATE_WIDTH = 0.02  # of similarity, over which the gate opens
+_KNOWN = 0.5  # strength of a recall from which a landmark counts as known
+_SETTLED_S = 0.15  # of a landmark, before neurons say it and its place is learnt
+_CLEARLY = 0.3  # of similarity above the gate, where a landmark agrees beyond doubt
+_LOST_GAIN = 1.0  # of what the map says, to one who is lost
+
+
+class SSPStep(NamedTuple):
+    """What SSP-SLAM says after one step.
+
+    Attributes:
+        position_m: Where the animal is, ``(batch, dimension)``.
+        z: Fourier coefficients of it, complex, ``(batch, n_frequencies)``.
+        recall: Strength of what the map recalled, ``(batch,)``.
+        agreement: Similarity of where the map says it is with where it thinks it is, ``(batch,)``.
+        gate: How far the gate was open, ``(batch,)``.
+        lost: Whether the map is believed against the path, ``(batch,)``.
+        attended: Number of the landmark, ``(batch,)``.
+    """
+
+    position_m: Tensor
+    z: Tensor
+    recall: Tensor
+    agreement: Tensor
+    gate: Tensor
+    lost: Tensor
+    attended: Tensor
+
+
+class SSPSLAM(Running):
+    r"""Localises an animal and maps landmarks, semantically, in one of three tiers.
+
+    .. math:: \hat\phi(x_i) = \hat\phi(x) \circledast \phi(x_i - x), \qquad
+              u = \eta\, g\,(\hat\phi(x_i) \circledast \phi(x_i - x)^{-1} - \hat\phi(x))
+
+    The first is learnt as what a landmark's pointer recalls; the second, from what is recalled,
+    pulls the path integrator, where the gate :math:`g` finds that both agree. A known landmark that
+    contradicts for ``relocalise_after_s`` is believed: the animal was lost.
+
+    All tiers have the same parts; see their classes for the equations. Velocities and vectors to
+    landmarks are allocentric (turned by a compass).
+
+    State: that of the parts, ``pointers``, the time, what is attended to, and the evidence of being
+    lost. ``gate`` and ``gain`` are parameters, as are the frequencies of the space.
+
+    Args:
+        config: All of it.
+        pointers: Of the landmarks that it can tell apart, ``(landmarks, n_features)``.
+        names: Of the landmarks; ``None``: their numbers.
+        batch: Animals side by side.
+
+    Raises:
+        SpaceError: If pointers do not fit the space.
+    """
+
+    pointers: Tensor
+    time_s: Tensor
+    attended: Tensor
+    held_s: Tensor
+    contradicted_s: Tensor
+    recalled: Tensor
+    pull: Tensor
+
+    def __init__(
+        self,
+        config: SSPSLAMConfig,
+        pointers: Tensor,
+        names: Sequence[str] | None = None,
+        batch: int = 1,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.batch = batch
+        self.names = tuple(names or (str(k) for k in range(len(pointers))))
+        self.space = SSPSpace.from_config(config.space)
+        c, dt, seed, n = config, config.time_step_s, config.seed, self.space.n_features
+        if pointers.ndim != 2 or pointers.shape[1] != n:
+            raise SpaceError(
+                f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n}); "
+                "make them with SemanticPointers of as many features"
+            )
+        if len(self.names) != len(pointers) or len(set(self.names)) < len(self.names):
+            raise SpaceError(
+                f"SSPSLAM: {len(self.names)} names for {len(pointers)} pointers; "
+                "give each landmark one of its own"
+            )
+        neurons = c.neurons
+        if c.tier == "rate":
+            neurons = neurons.model_copy(update={"model": "lif_rate"})
+        self.register_buffer("pointers", pointers.detach().float().clone())
+        if c.tier == "algebraic":
+            self.integrator = AlgebraicIntegrator(self.space, c.integrator, dt, seed, batch)
+            self.map = AlgebraicMap(n, n, c.map, dt, batch)
+            self.places = AlgebraicMap(n, n, c.map, dt, batch) if c.places else None
+            self.vectors = self.grid = self.binding = self.unbinding = None
+        else:
+            self.integrator = PathIntegrator(self.space, c.integrator, neurons, dt, seed, batch)
+            keys = self.pointers if c.map.voja_rate == 0 else None
+            self.map = AssociativeMap(n, n, c.map, neurons, dt, seed + 1, batch, keys)
+            self.places = self._place_memory(neurons, seed + 6) if c.places else None
+            self.vectors = VectorPopulation.of_objects(
+                self.space, c.vector_neurons, neurons, dt, seed + 2, batch
+            )
+            self.grid = None
+            if c.grid_neurons:
+                self.grid = VectorPopulation.of_grid_cells(
+                    self.space, c.grid_neurons, neurons, dt, seed + 3, batch
+                )
+            if c.binding == "neurons":
+                k, size = self.space.n_frequencies, c.binding_neurons
+                self.binding = SpikingBinding(k, size, neurons, dt, seed + 4, batch)
+                self.unbinding = SpikingBinding(k, size, neurons, dt, seed + 5, batch)
+            else:
+                self.binding = self.unbinding = None
+        self.gate = nn.Parameter(torch.tensor(c.gate), requires_grad=False)
+        self.gain = nn.Parameter(torch.tensor(c.gain), requires_grad=False)
+        self.register_buffer("time_s", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("attended", torch.full((batch,), NOTHING))
+        self.register_buffer("held_s", torch.zeros(batch))
+        self.register_buffer("contradicted_s", torch.zeros(batch))
+        for name in ("recalled", "pull"):
+            self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
+
+    @property
+    def n_neurons(self) -> int:
+        """Of one animal, in all populations."""
+        return sum(part.n_neurons for part in self.parts.values())
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        """Populations that it has, by name."""
+        names = ("integrator", "map", "places", "vectors", "grid", "binding", "unbinding")
+        return {name: part for name in names if (part := getattr(self, name)) is not None}
+
+    def start(self, position_m: Tensor) -> None:
+        """Tell it where it is, ``(batch, dimension)``; what it has learnt stays."""
+        position = self._positions(position_m)
+        self.integrator.start(position)
+        self.contradicted_s = torch.zeros_like(self.contradicted_s)
+
+    def forward(self, velocity_m_s: Tensor, view: LandmarkView | None = None) -> SSPStep:
+        """Live one step; gradients reach the space, ``gate`` and ``gain``.
+
+        Args:
+            velocity_m_s: ``(batch, dimension)``.
+            view: What is in view, arrays that lead with ``(batch,)``; ``None``: nothing.
+
+        Raises:
+            SpaceError: If anything does not fit or is not a number; nothing has changed then.
+        """
+        velocity, sight = self._inputs(velocity_m_s.unsqueeze(0), _with_time(view))
+        return self._step(velocity[0], *(part[0] for part in sight))
+
+    @torch.inference_mode()
+    def run(
+        self,
+        velocity_m_s: Tensor,
+        view: LandmarkView | None = None,
+        watch: Callable[[int, SSPStep], None] | None = None,
+    ) -> SSPStep:
+        """Live many steps, without gradients.
+
+        Args:
+            velocity_m_s: ``(steps, batch, dimension)``.
+            view: What is in view, arrays that lead with ``(steps, batch)``; ``None``: nothing.
+            watch: Called after each step with its number and what was said.
+
+        Returns:
+            What was said, with the steps in front.
+        """
+        said = []
+        for begin in range(0, len(velocity_m_s), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            velocity, sight = self._inputs(velocity_m_s[part], _cut(view, part))
+            for k, v in enumerate(velocity):
+                said.append(self._step(v, *(p[k] for p in sight)))
+                if watch is not None:
+                    watch(begin + k, said[-1])
+        return SSPStep(*(torch.stack(column) for column in zip(*said, strict=True)))
+
+    def _step(
+        self, velocity: Tensor, key: Tensor, vector: Tensor, attended: Tensor, held_s: Tensor
+    ) -> SSPStep:
+        c, space = self.config, self.space
+        seen = (attended != NOTHING).to(key)
+        settled = held_s >= (0.0 if c.tier == "algebraic" else _SETTLED_S)
+        z = self.integrator(velocity, torch.view_as_complex(self.pull))
+        # Where the landmark is: the position, cleaned up, moved by the vector to it.
+        here = space.encode_fourier(self.integrator.position_m)
+        if self.grid is not None:
+            here = self.grid(here)
+        if self.vectors is not None:
+            vector = self.vectors(vector) * seen.unsqueeze(-1)
+        place = here * vector if self.binding is None else self.binding(here, vector)
+        strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
+        lost = self._is_lost()
+        plasticity = (settled & ~lost).to(key) * self._plasticity(strength)
+        place = space.from_fourier(place)
+        recall = space.to_fourier(self.map(key, place, seen, plasticity))
+        if self.places is not None:
+            self.places(place * seen.unsqueeze(-1), key, seen, (settled & ~lost).to(key))
+        # Where that puts the animal: what is recalled, moved back by the vector to it.
+        back = vector.conj()
+        told = recall * back if self.unbinding is None else self.unbinding(recall, back)
+        agreement = (told.real * z.real + told.imag * z.imag).mean(-1)
+        gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * (seen * settled)
+        known = (strength > _KNOWN) & (seen > 0) & settled
+        self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
+        unit = told / told.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
+        gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
+        self.pull = torch.view_as_real(gain.unsqueeze(-1) * (unit - z))
+        self.recalled = torch.view_as_real(recall)
+        self.time_s = self.time_s + c.time_step_s
+        self.attended, self.held_s = attended, held_s
+        position = self.integrator.position_m
+        return SSPStep(position, z, strength, agreement, gate, lost, attended)
+
+    def _place_memory(self, neurons: NeuronConfig, seed: int) -> AssociativeMap:
+        """A memory whose keys are places: it fires as place cells do."""
+        c, draw = self.config, torch.Generator().manual_seed(seed)
+        low, high = self.space.bounds_m.T.float()
+        at = low + (high - low) * torch.rand(c.map.neurons, len(low), generator=draw)
+        n, keys = self.space.n_features, self.space.encode(at).detach()
+        config = c.map.model_copy(update={"voja_rate": 0.0})
+        return AssociativeMap(n, n, config, neurons, c.time_step_s, seed, self.batch, keys)
+
+    def _plasticity(self, strength: Tensor) -> Tensor:
+        """Share of the rate of learning that is left for what is recalled so strongly."""
+        c = self.config.map
+        if c.plasticity == "constant":
+            return torch.ones_like(strength)
+        return (1.0 - strength.square()).clamp(c.least_plasticity, 1.0)
+
+    def _is_lost(self) -> Tensor:
+        after = self.config.relocalise_after_s
+        if after == 0:
+            return torch.zeros_like(self.contradicted_s, dtype=torch.bool)
+        return self.contradicted_s > after
+
+    def _note_contradiction(self, known: Tensor, agreement: Tensor) -> None:
+        """Count for how long known landmarks contradict; one that clearly agrees ends it."""
+        longer = torch.where(
+            agreement < self.gate,
+            self.contradicted_s + self.config.time_step_s,
+            self.contradicted_s,
+        )
+        longer = torch.where(agreement > self.gate + _CLEARLY, 0.0, longer)
+        self.contradicted_s = torch.where(known, longer, self.contradicted_s).detach()
+
+    def _inputs(self, velocity: Tensor, view: LandmarkView | None) -> tuple[Tensor, Sight]:
+        """Check and prepare what some steps take in; nothing is changed by it."""
+        m, kind = self.space.dimension, self.pointers
+        if velocity.ndim != 3 or velocity.shape[1:] != (self.batch, m):
+            raise SpaceError(
+                f"SSPSLAM: velocities of shape {tuple(velocity.shape)[1:]}, "
+                f"expected (batch, dimension) = {(self.batch, m)}"
+            )
+        if not bool(torch.isfinite(velocity).all()):
+            raise SpaceError("SSPSLAM: a velocity is not a number; mend or drop that step")
+        steps = len(velocity)
+        velocity = velocity.to(kind)
+        if view is None:
+            key = kind.new_zeros(steps, self.batch, kind.shape[1])
+            z = torch.zeros(steps, self.batch, self.space.n_frequencies, 2).to(kind)
+            attended = torch.full((steps, self.batch), NOTHING, device=kind.device)
+            vector = torch.view_as_complex(z)
+        else:
+            key, vector, attended = self._seen(view, steps)
+        held_s = held(attended, self.attended, self.held_s, self.config.time_step_s)
+        return velocity, Sight(key, vector, attended, held_s)
+
+    def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Pointers and vectors of what is attended to, and which landmark that is."""
+        c, kind, n = self.config, self.pointers, len(self.pointers)
+        in_view = torch.as_tensor(np.asarray(view.in_view), device=kind.device)
+        if in_view.shape != (steps, self.batch, n):
+            raise SpaceError(
+                f"SSPSLAM: landmarks in view of shape {tuple(in_view.shape)}, expected "
+                f"{(steps, self.batch, n)}: one column for each pointer"
+            )
+        distance, low, high = (
+            torch.as_tensor(np.asarray(part)).to(kind)
+            for part in (view.distance_m, view.low_m, view.high_m)
+        )
+        if low.shape[-1] != self.space.dimension:
+            raise SpaceError(
+                f"SSPSLAM: landmarks in {low.shape[-1]} dimensions, the space has "
+                f"{self.space.dimension}"
+            )
+        for part in (low, high):
+            if not bool(torch.isfinite(part[in_view[..., view.box_landmark]]).all()):
+                raise SpaceError("SSPSLAM: the place of a landmark in view is not a number")
+        boxes, weight = _boxes_of(view, n)
+        boxes, weight = boxes.to(kind.device), weight.to(kind)
+        if c.attention == "sum":
+            z = region_vectors(self.space, low[..., boxes, :], high[..., boxes, :], weight)
+            key = in_view.to(kind) @ kind
+            vector = (z * in_view.unsqueeze(-1)).sum(-2)
+            several = torch.where(in_view.sum(-1) > 1, SEVERAL, in_view.to(torch.uint8).argmax(-1))
+            return key, vector, torch.where(in_view.any(-1), several, NOTHING)
+        time = self.time_s + c.time_step_s * torch.arange(steps, dtype=torch.float64)
+        attended = attend(in_view, distance, time, c.turn_s, c.attention)
+        some, which = attended != NOTHING, attended.clamp_min(0)
+        mine = boxes[which].unsqueeze(-1).expand(-1, -1, -1, low.shape[-1])
+        z = region_vectors(self.space, low.gather(2, mine), high.gather(2, mine), weight[which])
+        some = some.unsqueeze(-1)
+        return kind[which] * some, z * some, attended
+
+    def _positions(self, position_m: Tensor) -> Tensor:
+        """Check positions against the space."""
+        position = torch.as_tensor(position_m).to(self.pointers)
+        if position.shape != (self.batch, self.space.dimension):
+            raise SpaceError(
+                f"SSPSLAM: position of shape {tuple(position.shape)}, expected "
+                f"(batch, dimension) = {(self.batch, self.space.dimension)}"
+            )
+        low, high = self.space.bounds_m.T.to(position)
+        inside = (position >= low) & (position <= high)
+        if not bool(inside.all()):
+            raise SpaceError(
+                f"SSPSLAM: position {position[~inside.all(-1)][0].tolist()} is outside the "
+                f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
+            )
+        return position
+
+
+def _boxes_of(view: LandmarkView, n_landmarks: int) -> tuple[Tensor, Tensor]:
+    """Boxes of each landmark, ``(landmarks, most boxes)``, and their shares by size."""
+    owner = np.asarray(view.box_landmark)
+    size = np.asarray(view.high_m)[0, 0] - np.asarray(view.low_m)[0, 0]
+    measure = np.where(size > 0, size, 1.0).prod(-1)
+    most = max(1, int(np.bincount(owner, minlength=n_landmarks).max()))
+    boxes, weight = np.zeros((n_landmarks, most), dtype=np.int64), np.zeros((n_landmarks, most))
+    for landmark in range(n_landmarks):
+        own = np.flatnonzero(owner == landmark)
+        boxes[landmark, : len(own)], weight[landmark, : len(own)] = own, measure[own]
+    return torch.from_numpy(boxes), torch.from_numpy(
+        weight / weight.sum(-1, keepdims=True).clip(1e-12)
+    )
+
+
+def _with_time(view: LandmarkView | None) -> LandmarkView | None:
+    return None if view is None else _each(view, lambda a: np.asarray(a)[None])
+
+
+def _cut(view: LandmarkView | None, part: slice) -> LandmarkView | None:
+    return None if view is None else _each(view, lambda a: a[part])
+
+
+def _each(view: LandmarkView, change: Callable[[np.ndarray], np.ndarray]) -> LandmarkView:
+    """Change what leads with time; whose boxes they are stays."""
+    changed = {f: change(getattr(view, f)) for f in view._fields if f != "box_landmark"}
+    return view._replace(**changed)
