@@ -42,9 +42,9 @@ def merge_semantic_maps(
     r"""Join the map of a session to one that was loaded; neither is altered.
 
     The vectors of a landmark in both maps, unbound, say how the maps lie:
-    :math:`\hat\phi_l(x_i) \circledast \hat\phi_p(x_i)^{-1} \approx \phi(\Delta)`, for points and
-    for regions. Most landmarks must agree on :math:`\Delta`. All of the partial map is moved by it, and
-    both are written into one memory. The session that goes on is the partial one.
+    :math:`\hat\phi_l(x_i) \circledast \hat\phi_p(x_i)^{-1} \approx \phi(\Delta)`, points and
+    regions alike. Most landmarks must agree on :math:`\Delta`. All of the partial map is moved by
+    it, and both are written into one memory. The session that goes on is the partial one.
 
     Args:
         loaded: The map that is merged into.

@@ -13,7 +13,8 @@ from neuroslam.spiking.space import SSPSpace
 
 _LEAST_STRENGTH = 0.4  # of what is left, in which one more place is looked for
 _MOST_PLACES = 50
-_REFINEMENTS = 8
+_REFINEMENTS = 12
+_TWO = 1.4  # strength from which on a place may be two
 
 
 class Places(NamedTuple):
@@ -58,10 +59,43 @@ def places_in(space: SSPSpace, z: Tensor, least: float = _LEAST_STRENGTH) -> Pla
             break
         found, strength = _together(space, z, torch.cat([found, best.position_m]))
         rest = z - strength.to(z.dtype) @ space.encode_fourier(found)
+    found, strength = _split(space, z, found, strength)
     keep = strength >= least
     found, strength = found[keep], strength[keep]
     order = strength.argsort(descending=True)
     return Places(found[order], strength[order])
+
+
+def _split(space: SSPSpace, z: Tensor, at: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
+    """Take apart what counts for two: places nearer than a wave is long look like one.
+
+    Both are tried on opposite sides of it, in several directions; the pair stays whose sum is
+    nearer to the vector, if none of the two is weak.
+    """
+    apart = 0.3 / space.wave_vectors.detach().abs().amax(0)
+    for _ in range(len(at)):
+        double = int(strength.argmax()) if len(strength) else -1
+        if double < 0 or strength[double] < _TWO:
+            return at, strength
+        others = torch.cat([at[:double], at[double + 1 :]])
+        best = None
+        for way in _directions(at.shape[1]).to(at):
+            pair = at[double] + apart * torch.stack([way, -way])
+            moved, share = _together(space, z, torch.cat([others, pair]))
+            left = float((z - share.to(z.dtype) @ space.encode_fourier(moved)).abs().square().sum())
+            if best is None or left < best[0]:
+                best = left, moved, share
+        if best[2][-2:].min() < _LEAST_STRENGTH:
+            return at, strength
+        at, strength = best[1], best[2]
+    return at, strength
+
+
+def _directions(dimension: int) -> Tensor:
+    """Half of the directions to the neighbours of a cell, ``(n, dimension)``."""
+    ways = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * dimension)
+    ways = ways.reshape(-1, dimension)
+    return ways[: len(ways) // 2]
 
 
 def _together(space: SSPSpace, z: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:

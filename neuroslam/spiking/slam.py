@@ -179,6 +179,7 @@ class SSPSLAM(Running):
         velocity_m_s: Tensor,
         view: LandmarkView | None = None,
         watch: Callable[[int, SSPStep], None] | None = None,
+        every: int = 1,
     ) -> SSPStep:
         """Live many steps, without gradients.
 
@@ -186,6 +187,7 @@ class SSPSLAM(Running):
             velocity_m_s: ``(steps, batch, dimension)``.
             view: What is in view, arrays that lead with ``(steps, batch)``; ``None``: nothing.
             watch: Called after each step with its number and what was said.
+            every: Of so many steps the last is returned.
 
         Returns:
             What was said, with the steps in front.
@@ -195,9 +197,11 @@ class SSPSLAM(Running):
             part = slice(begin, begin + _CHUNK)
             velocity, sight = self._inputs(velocity_m_s[part], _cut(view, part))
             for k, v in enumerate(velocity):
-                said.append(self._step(v, *(p[k] for p in sight)))
+                step = self._step(v, *(p[k] for p in sight))
                 if watch is not None:
-                    watch(begin + k, said[-1])
+                    watch(begin + k, step)
+                if (begin + k + 1) % every == 0:
+                    said.append(step)
         return SSPStep(*(torch.stack(column) for column in zip(*said, strict=True)))
 
     def _step(
