@@ -74,7 +74,9 @@ class PathIntegratorConfig(Section):
 
     neurons: int = Field(800, ge=10, description="of one oscillator; more: less drift")
     max_speed_m_s: float = Field(0.5, gt=0, description="faster is cut; larger: coarser rates")
-    tau_s: float = Field(0.05, gt=0, description="recurrent synapse; longer: less noise")
+    tau_s: float = Field(
+        0.1, gt=0, description="recurrent synapse; longer: less drift, and corrections act slower"
+    )
     input_tau_s: float = Field(0.005, gt=0, description="synapse of corrections")
     output_tau_s: float = Field(0.005, gt=0, description="synapse of what is read out")
     stabilise: float = Field(1.0, ge=0, description="pull to the unit circle, Eq. 19; 0: none")
@@ -82,13 +84,13 @@ class PathIntegratorConfig(Section):
         (0.8, 1.2), description="amplitudes for which decoders are solved; (0, ...): a whole disc"
     )
     decoder_noise: float = Field(
-        0.02, gt=0, description="of the highest rate, that decoders are solved against"
+        0.005, gt=0, description="of the highest rate, that decoders are solved against"
     )
     coupling: Literal["none", "modules", "manifold"] = Field(
         "manifold",
         description="modules: phases of each close; manifold: all agree on one position",
     )
-    coupling_gain: float = Field(0.5, ge=0, description="of the pull, over input_tau_s per second")
+    coupling_gain: float = Field(1.0, ge=0, description="of the pull; over tau_s, its rate")
     velocity_neurons: int = Field(
         0, ge=0, description="neurons that say the velocity, with their noise; 0: exact"
     )
@@ -132,15 +134,15 @@ class SSPSLAMConfig(Section):
         "neurons", description="circular convolution in populations, or exactly"
     )
     binding_neurons: int = Field(50, ge=2, description="of each product of two numbers")
-    vector_neurons: int = Field(550, ge=10, description="object-vector cells")
+    vector_neurons: int = Field(550, ge=0, description="object-vector cells; 0: exact")
     places: bool = Field(False, description="learn what is at places, too: areas can be asked for")
     grid_neurons: int = Field(0, ge=0, description="grid cells that say the position; 0: exact")
     attention: Literal["sum", "nearest", "turns"] = Field(
         "turns", description="of several landmarks in view: all at once, one, one after another"
     )
-    turn_s: float = Field(0.1, gt=0, description="how long a landmark is attended to")
+    turn_s: float = Field(0.5, gt=0, description="how long a landmark is attended to")
     gate: float = Field(0.2, description="similarity below which the map does not correct")
-    gain: float = Field(0.2, ge=0, description="of a correction, over input_tau_s per second")
+    gain: float = Field(0.2, ge=0, description="of a correction; over integrator.tau_s, its rate")
     relocalise_after_s: float = Field(
         0.5, ge=0, description="of a known landmark that contradicts, then it is believed; 0: never"
     )

@@ -29,7 +29,6 @@ class Life(NamedTuple):
         position_m: Where each believed to be, the same shape.
         error_m: ``(steps, animals)``.
         similarity_error: One minus the similarity of its vector to the true one's, the same shape.
-        said: All of it.
         seen_s: For how long each has seen each landmark, ``(animals, landmarks)``.
     """
 
@@ -38,7 +37,6 @@ class Life(NamedTuple):
     position_m: np.ndarray
     error_m: np.ndarray
     similarity_error: np.ndarray
-    said: SSPStep
     seen_s: np.ndarray
 
     @property
@@ -89,35 +87,55 @@ def live(slam: SSPSLAM, worlds: Sequence[LandmarkWorld], paths: Sequence[Landmar
         worlds: Of each.
         paths: Of each, of equal length.
     """
-    dt = slam.config.time_step_s
-    paths = [path.resampled(dt) for path in paths]
-    truth = np.stack([path.position_m for path in paths], axis=1)
-    velocity = torch.from_numpy(np.stack([path.velocity_m_s for path in paths], axis=1))
+    truth, velocity, every = _ways(slam, paths)
     slam.start(torch.from_numpy(truth[0]))
-    every = max(1, round(1.0 / (KEPT_HZ * dt)))
     said, seen = [], np.zeros((len(paths), len(worlds[0].landmarks)))
-    for begin in range(0, len(truth) - len(truth) % every, _PIECE):
-        part = slice(begin, min(begin + _PIECE, len(truth) - len(truth) % every))
+    for begin in range(0, len(truth), _PIECE):
+        part = slice(begin, begin + _PIECE)
         view = views(worlds, truth[part])
-        seen += view.in_view.sum(0) * dt
+        seen += view.in_view.sum(0) * slam.config.time_step_s
         said.append(slam.run(velocity[part], view, every=every))
     whole = SSPStep(*(torch.cat(column) for column in zip(*said, strict=True)))
-    at = truth[every - 1 :: every][: len(whole.z)]
-    position = whole.position_m.double().numpy()
-    space = slam.space
+    return _life(slam, truth[every - 1 :: every], whole.position_m, whole.z, seen)
+
+
+@torch.inference_mode()
+def integrate(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> Life:
+    """Let the path integrator alone go along paths; the rest of the animals sleeps."""
+    truth, velocity, every = _ways(slam, paths)
+    walk = slam.integrator
+    walk.start(torch.from_numpy(truth[0]))
+    said = []
+    for k, v in enumerate(velocity.to(slam.pointers)):
+        z = walk(v)
+        if (k + 1) % every == 0:
+            said.append((walk.position_m, z))
+    position, z = (torch.stack(column) for column in zip(*said, strict=True))
+    return _life(slam, truth[every - 1 :: every], position, z, np.zeros((len(paths), 0)))
+
+
+def _ways(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> tuple[np.ndarray, torch.Tensor, int]:
+    """True positions, velocities, and of how many steps one is kept."""
+    dt = slam.config.time_step_s
+    every = max(1, round(1.0 / (KEPT_HZ * dt)))
+    paths = [path.resampled(dt) for path in paths]
+    n = len(paths[0].position_m) // every * every
+    truth = np.stack([path.position_m[:n] for path in paths], axis=1)
+    velocity = np.stack([path.velocity_m_s[:n] for path in paths], axis=1)
+    return truth, torch.from_numpy(velocity), every
+
+
+def _life(
+    slam: SSPSLAM, truth: np.ndarray, position: torch.Tensor, z: torch.Tensor, seen: np.ndarray
+) -> Life:
+    every = max(1, round(1.0 / (KEPT_HZ * slam.config.time_step_s)))
     with torch.inference_mode():
-        true_z = space.encode_fourier(torch.from_numpy(at))
-        alike = (whole.z * true_z.conj()).real.sum(-1)
-        alike = (1.0 + 2.0 * alike) / space.n_features
-    return Life(
-        (np.arange(len(at)) + 1) * every * dt,
-        at,
-        position,
-        np.linalg.norm(position - at, axis=-1),
-        1.0 - alike.numpy(),
-        whole,
-        seen,
-    )
+        true_z = slam.space.encode_fourier(torch.from_numpy(truth))
+        alike = (1.0 + 2.0 * (z * true_z.conj()).real.sum(-1)) / slam.space.n_features
+    where = position.double().numpy()
+    time = (np.arange(len(truth)) + 1) * every * slam.config.time_step_s
+    error = np.linalg.norm(where - truth, axis=-1)
+    return Life(time, truth, where, error, 1.0 - alike.numpy(), seen)
 
 
 def recalled(slam: SSPSLAM) -> np.ndarray:

@@ -82,7 +82,7 @@ class AlgebraicIntegrator(Packet):
         z = self.z
         pull = coupled(z, pull, self.position_m, self.space, c)
         if pull is not None:
-            z = z + pull * (1.0 - math.exp(-dt / c.input_tau_s))
+            z = z + pull * (1.0 - math.exp(-dt / c.tau_s))
         z = z / z.abs().clamp_min(1e-6) * torch.polar(torch.ones_like(turn), turn)
         self.phasor = torch.view_as_real(z)
         return self.locate()

@@ -17,7 +17,7 @@ from neuroslam.spiking.ensemble import (
 
 _SOLVER_POINTS = 1000
 _RADIUS = math.sqrt(2.0)  # of a sum or difference of two numbers of at most 1, over root 2
-_TAU_S = 0.005
+TAU_S = 0.03  # noise of few neurons; who compares with it waits as long
 
 
 class SpikingBinding(Running):
@@ -66,7 +66,7 @@ class SpikingBinding(Running):
         tuning = tuning._replace(encoders=tuning.encoders.sign())
         self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
         points = torch.linspace(-_RADIUS, _RADIUS, _SOLVER_POINTS).expand(groups, -1).unsqueeze(-1)
-        decoders = solve_decoders(self.neurons.rates(points), points.square())
+        decoders = solve_decoders(self.neurons.rates(points), points.square(), noise=0.01)
         self.register_buffer("decoders", decoders / time_step_s)
         self.register_buffer("product", torch.zeros(batch, n_frequencies, 2))
 
@@ -91,5 +91,5 @@ class SpikingBinding(Running):
         squares = torch.bmm(fired, self.decoders).reshape(2, 4, a.shape[-1], len(a))
         rr, ii, ri, ir = 0.5 * (squares[0] - squares[1])
         product = torch.stack([rr - ii, ri + ir], dim=-1).transpose(0, 1)
-        self.product = lowpass(self.product, product, synapse(_TAU_S, self.time_step_s))
+        self.product = lowpass(self.product, product, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.product)

@@ -56,10 +56,10 @@ def lif_step(
     :math:`\delta` is the part of the step in which a neuron is not refractory; after a spike it is,
     until :math:`t_s + \tau_{ref}` (the conventions of Nengo).
 
-    No exponential or logarithm is left to be taken. A refractory voltage is zero, so what it
-    has gained when it wakes is a share
-    :math:`(1 - e^{-\delta/\tau}) / (1 - e^{-\Delta t/\tau})` of what a whole step brings; and as :math:`e^{-(\Delta t - t_s)/\tau} = 1 - (v-1)/(J-1)`, that share
-    follows from the overshoot by a multiplication.
+    No exponential or logarithm is left to be taken. A refractory voltage is zero, so what it has
+    gained when it wakes is a share, :math:`1 - e^{-\delta/\tau}` over
+    :math:`1 - e^{-\Delta t/\tau}`, of what a whole step brings. As
+    :math:`e^{-(\Delta t - t_s)/\tau} = 1 - (v-1)/(J-1)`, it follows from the overshoot.
 
     Args:
         state: Of the step before.

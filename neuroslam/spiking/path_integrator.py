@@ -249,7 +249,7 @@ class PathIntegrator(Packet):
         Args:
             velocity_m_s: ``(batch, dimension)``.
             pull: Correction :math:`u`, complex, ``(batch, n_frequencies)``: acts like
-                :math:`\dot z = u / \tau_{in}`.
+                :math:`\dot z = u / \tau`.
 
         Returns:
             Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.

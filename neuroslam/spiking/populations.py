@@ -17,7 +17,7 @@ from neuroslam.spiking.ensemble import (
 from neuroslam.spiking.space import SSPSpace
 
 _SOLVER_POINTS = 3000
-_TAU_S = 0.01
+TAU_S = 0.01
 _INTERCEPTS = (0.1, 0.9)  # similarity to its own place at which a cell begins to fire
 
 
@@ -144,7 +144,7 @@ class VectorPopulation(Running):
         """Step with a vector; return what the neurons say it is, both complex, ``(batch, k)``."""
         spikes = self.neurons(torch.view_as_real(z).flatten(-2).unsqueeze(0))[0]
         said = (spikes @ self.decoders).reshape(self.decoded.shape)
-        self.decoded = lowpass(self.decoded, said, synapse(_TAU_S, self.time_step_s))
+        self.decoded = lowpass(self.decoded, said, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.decoded)
 
 

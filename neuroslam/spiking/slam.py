@@ -14,8 +14,11 @@ from neuroslam.sensors.landmarks import LandmarkView
 from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, region_vectors
+from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
+from neuroslam.spiking.ensemble import lowpass, synapse
 from neuroslam.spiking.path_integrator import PathIntegrator
+from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.space import SSPSpace
 
@@ -79,9 +82,12 @@ class SSPSLAM(Running):
     time_s: Tensor
     attended: Tensor
     held_s: Tensor
+    familiar: Tensor
     contradicted_s: Tensor
     recalled: Tensor
     pull: Tensor
+    here: Tensor
+    there: Tensor
 
     def __init__(
         self,
@@ -120,10 +126,11 @@ class SSPSLAM(Running):
             keys = self.pointers if c.map.voja_rate == 0 else None
             self.map = AssociativeMap(n, n, c.map, neurons, dt, seed + 1, batch, keys)
             self.places = self._place_memory(neurons, seed + 6) if c.places else None
-            self.vectors = VectorPopulation.of_objects(
-                self.space, c.vector_neurons, neurons, dt, seed + 2, batch
-            )
-            self.grid = None
+            self.vectors = self.grid = None
+            if c.vector_neurons:
+                self.vectors = VectorPopulation.of_objects(
+                    self.space, c.vector_neurons, neurons, dt, seed + 2, batch
+                )
             if c.grid_neurons:
                 self.grid = VectorPopulation.of_grid_cells(
                     self.space, c.grid_neurons, neurons, dt, seed + 3, batch
@@ -139,8 +146,9 @@ class SSPSLAM(Running):
         self.register_buffer("time_s", torch.zeros((), dtype=torch.float64))
         self.register_buffer("attended", torch.full((batch,), NOTHING))
         self.register_buffer("held_s", torch.zeros(batch))
+        self.register_buffer("familiar", torch.zeros(batch, dtype=torch.bool))
         self.register_buffer("contradicted_s", torch.zeros(batch))
-        for name in ("recalled", "pull"):
+        for name in ("recalled", "pull", "here", "there"):
             self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
 
     @property
@@ -209,7 +217,8 @@ class SSPSLAM(Running):
     ) -> SSPStep:
         c, space = self.config, self.space
         seen = (attended != NOTHING).to(key)
-        settled = held_s >= (0.0 if c.tier == "algebraic" else _SETTLED_S)
+        # Neurons need a while to say a landmark; vectors a step, and one to be compared.
+        settled = held_s > (1.5 * c.time_step_s if c.tier == "algebraic" else _SETTLED_S)
         z = self.integrator(velocity, torch.view_as_complex(self.pull))
         # Where the landmark is: the position, cleaned up, moved by the vector to it.
         here = space.encode_fourier(self.integrator.position_m)
@@ -217,6 +226,7 @@ class SSPSLAM(Running):
             here = self.grid(here)
         if self.vectors is not None:
             vector = self.vectors(vector) * seen.unsqueeze(-1)
+            here = self._late("here", here, TAU_VECTOR_S)
         place = here * vector if self.binding is None else self.binding(here, vector)
         strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
         lost = self._is_lost()
@@ -226,18 +236,22 @@ class SSPSLAM(Running):
         if self.places is not None:
             self.places(place * seen.unsqueeze(-1), key, seen, (settled & ~lost).to(key))
         # Where that puts the animal: what is recalled, moved back by the vector to it.
-        back = vector.conj()
-        told = recall * back if self.unbinding is None else self.unbinding(recall, back)
-        agreement = (told.real * z.real + told.imag * z.imag).mean(-1)
-        gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * (seen * settled)
-        known = (strength > _KNOWN) & (seen > 0) & settled
+        told = recall * vector.conj()
+        if self.unbinding is not None:
+            told = self.unbinding(recall, vector.conj())
+            here = self._late("there", here, TAU_BINDING_S)
+        agreement = (told.real * here.real + told.imag * here.imag).mean(-1)
+        # What is learnt in this very visit knows no more than the animal does.
+        familiar = torch.where(settled, self.familiar, strength > _KNOWN)
+        known = familiar & settled & (seen > 0)
+        gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * known
         self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
         unit = told / told.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
-        self.pull = torch.view_as_real(gain.unsqueeze(-1) * (unit - z))
+        self.pull = torch.view_as_real(gain.unsqueeze(-1) * (unit - here))
         self.recalled = torch.view_as_real(recall)
         self.time_s = self.time_s + c.time_step_s
-        self.attended, self.held_s = attended, held_s
+        self.attended, self.held_s, self.familiar = attended, held_s, familiar
         position = self.integrator.position_m
         return SSPStep(position, z, strength, agreement, gate, lost, attended)
 
@@ -249,6 +263,13 @@ class SSPSLAM(Running):
         n, keys = self.space.n_features, self.space.encode(at).detach()
         config = c.map.model_copy(update={"voja_rate": 0.0})
         return AssociativeMap(n, n, config, neurons, c.time_step_s, seed, self.batch, keys)
+
+    def _late(self, name: str, z: Tensor, tau_s: float) -> Tensor:
+        """Delay by as much as the other's synapse does, or who moves would be pulled back."""
+        kept = synapse(tau_s, self.config.time_step_s)
+        late = lowpass(getattr(self, name), torch.view_as_real(z), kept)
+        setattr(self, name, late)
+        return torch.view_as_complex(late)
 
     def _plasticity(self, strength: Tensor) -> Tensor:
         """Share of the rate of learning that is left for what is recalled so strongly."""
