@@ -12,6 +12,7 @@ from benchmarks import (
     bench_navigation,
     bench_pose_cells,
     bench_relaxation,
+    bench_ssp,
     bench_view_search,
 )
 
@@ -27,6 +28,7 @@ def main() -> None:
         bench_merge,
         bench_arena,
         bench_navigation,
+        bench_ssp,
         bench_end_to_end,
     ):
         for row in module.rows():

@@ -85,7 +85,7 @@ class AlgebraicIntegrator(Packet):
             z = z + pull * (1.0 - math.exp(-dt / c.tau_s))
         z = z / z.abs().clamp_min(1e-6) * torch.polar(torch.ones_like(turn), turn)
         self.phasor = torch.view_as_real(z)
-        return self.locate()
+        return self.locate(velocity_m_s)
 
 
 class AlgebraicMap(Running):
@@ -135,7 +135,7 @@ class AlgebraicMap(Running):
         self, key: Tensor, value: Tensor, seen: Tensor, plasticity: Tensor | None = None
     ) -> Tensor:
         """Recall a key's value and learn; arguments as those of the neurons' map."""
-        recall = (self.weights @ key.unsqueeze(-1)).squeeze(-1)
+        recall = torch.bmm(key.unsqueeze(1), self.weights.mT).squeeze(1)
         rate = seen * (1.0 - math.exp(-self.config.learning_rate_s * self.time_step_s))
         rate = rate if plasticity is None else rate * plasticity
         error = (value - recall) * rate.unsqueeze(-1)

@@ -120,8 +120,9 @@ class AssociativeMap(Running):
             What is recalled, filtered, ``(batch, n_value)``.
         """
         c, dt = self.config, self.time_step_s
-        missing = 1.0 - self.memory.bias - (self.encoders @ key.unsqueeze(-1)).squeeze(-1)
-        spikes = self.memory.fire((self.memory.charged * missing).unsqueeze(0))[0]
+        # In this order, as the other way round takes seven times as long.
+        current = self.memory.bias + torch.bmm(key.unsqueeze(1), self.encoders.mT).squeeze(1)
+        spikes = self.memory.fire((self.memory.charged * (1.0 - current)).unsqueeze(0))[0]
         said = self.error_said(seen)
         passed = self.recalled
         if c.relay:

@@ -209,6 +209,15 @@ class NeuronArray(Running):
         rest = (share * (1.0 - self.bias)).unsqueeze(1)
         return self.fire(torch.baddbmm(rest, x, self.weights.mT, alpha=-share))
 
+    def drive_on_line(self, x: Tensor) -> Tensor:
+        """Return the drive of neurons for one dimension, ``(groups, batch, 1)`` in.
+
+        Products of numbers, which is quicker than of matrices with one column.
+        """
+        share = self.charged
+        rest, slope = share * (1.0 - self.bias), self.weights.squeeze(-1)
+        return torch.addcmul(rest.unsqueeze(1), x, slope.unsqueeze(1), value=-share)
+
     def fire(self, drive: Tensor) -> Tensor:
         """Step with currents as input.
 

@@ -1,5 +1,6 @@
 """Local rules by which populations learn: prescribed error sensitivity, and Voja's."""
 
+import torch
 from torch import Tensor
 
 
@@ -16,7 +17,7 @@ def pes_step(decoders: Tensor, error: Tensor, activity: Tensor, rate: float) -> 
         activity: :math:`a`, filtered rates in Hz, ``(batch, neurons)``.
         rate: :math:`\kappa \Delta t / N`.
     """
-    return decoders.baddbmm(activity.unsqueeze(-1), error.unsqueeze(-2), alpha=-rate)
+    return decoders.addcmul(activity.unsqueeze(-1), error.unsqueeze(-2), value=-rate)
 
 
 def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate: Tensor) -> Tensor:
@@ -24,7 +25,9 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
 
     .. math:: \Delta \hat e_i = \kappa\, s_i\, (\alpha_i x - \hat e_i)
 
-    (Voelker et al. 2014; SSP-SLAM, Eq. 15) with encoders :math:`\hat e` that hold the gain.
+    (Voelker et al. 2014; SSP-SLAM, Eq. 15) with encoders :math:`\hat e` that hold the gain. Few
+    neurons fire in a step: theirs are changed in place, as a copy of all weights would cost more
+    than all else.
 
     Args:
         encoders: ``(batch, neurons, dimensions)``.
@@ -33,6 +36,10 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
         key: :math:`x`, ``(batch, dimensions)``.
         rate: :math:`\kappa`, for each animal, ``(batch, 1)``.
     """
-    moved = spikes * rate
-    kept = encoders * (1.0 - moved).unsqueeze(-1)
-    return kept.baddbmm((moved * gain).unsqueeze(-1), key.unsqueeze(-2))
+    animal, neuron = torch.nonzero(spikes * rate, as_tuple=True)
+    moved = (spikes * rate)[animal, neuron].unsqueeze(-1)
+    towards = gain[neuron].unsqueeze(-1) * key[animal]
+    rows = torch.lerp(encoders[animal, neuron], towards, moved)
+    if torch.is_grad_enabled():
+        encoders = encoders.clone()
+    return encoders.index_put_((animal, neuron), rows)

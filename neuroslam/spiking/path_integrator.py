@@ -20,6 +20,7 @@ from neuroslam.spiking.space import SSPSpace
 
 _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
+_LOOK_S = 0.004  # between two looks at the packet
 _REREAD_STEPS = 100  # between two looks at the whole space for where the packet is
 _CLEARLY_BETTER = 0.05  # in similarity, where a packet elsewhere is believed
 
@@ -127,20 +128,23 @@ class Packet(Running):
         self.position_m = position_m.detach().to(self.position_m).clone()
         self.age = torch.zeros_like(self.age)
 
-    def locate(self) -> Tensor:
+    def locate(self, velocity_m_s: Tensor) -> Tensor:
         """Follow the packet to where it is now, and return its Fourier coefficients.
 
-        Now and then the whole space is searched, so that a packet that jumped is found.
+        It is looked at every few steps; in between the velocity says where it goes. Now and then
+        the whole space is searched, so that a packet that jumped is found.
         """
         z = self.z
-        position = self.decoder.track(z, self.position_m)
-        self.age = self.age + 1
-        if int(self.age) % _REREAD_STEPS == 0:
+        position = self.position_m + self.time_step_s * velocity_m_s
+        age = int(self.age) + 1
+        if age % max(1, round(_LOOK_S / self.time_step_s)) == 0:
+            position = self.decoder.track(z, position)
+        if age % _REREAD_STEPS == 0:
             best = self.decoder(z)
             here = self.decoder.similarity(z, position)
             jumped = best.similarity > here + _CLEARLY_BETTER
             position = torch.where(jumped.unsqueeze(-1), best.position_m, position)
-        self.position_m = position
+        self.position_m, self.age = position, self.age + 1
         return z
 
 
@@ -259,7 +263,7 @@ class PathIntegrator(Packet):
         pull = coupled(self.z, pull, self.position_m, self.space, self.config)
         parts = None if pull is None else torch.view_as_real(pull).transpose(0, 1)
         self.drive(share.T, parts)
-        return self.locate()
+        return self.locate(velocity_m_s)
 
     def drive(self, share: Tensor, pull: Tensor | None) -> None:
         """Move the oscillators on by one step, in their own terms.
