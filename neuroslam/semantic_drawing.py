@@ -193,11 +193,14 @@ def plot_vectors(
                 ax.plot(time_s[known], errors[name][known], color=colour, lw=1.1, label=label)
         dot = {"ls": "none", "marker": "o", "ms": 7, "mfc": "white", "mec": INK, "mew": 1.3}
         place.plot(*position_m, zorder=9, **dot)
-        write_title(place, "At the end", "x: recalled; arrows: vectors from the animal")
+        write_title(place, "At the end", "x: recalled · arrows: vectors")
         alike.set(xlabel="time (s)", ylabel="1 - similarity", xlim=(0, time_s[-1]))
-        far.set(xlabel="time (s)", ylabel="distance (m)", xlim=(0, time_s[-1]), ylim=(0, None))
+        known = [distance_error[n][time_s >= first_seen_s[n] + 1.0] for n in estimates_m]
+        most = max((float(e.max()) for e in known if len(e)), default=1.0)
+        far.set(xlabel="time (s)", ylabel="distance (m)", xlim=(0, time_s[-1]))
+        far.set_ylim(0, 1.5 * max(most, 1e-3))
         write_title(alike, "Error of the vector", "pale: not yet seen")
-        write_title(far, "Error of the place that it points to")
+        write_title(far, "Error of where it points", "scaled to a second after the first sight")
         handles, labels = alike.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)))
     return figure

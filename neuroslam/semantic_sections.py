@@ -111,7 +111,7 @@ class SemanticMapConfig(Section):
         "novelty", description="novelty: what is known is learnt slower"
     )
     least_plasticity: float = Field(
-        0.02, ge=0, le=1, description="share of the rate that is left for what is known"
+        0.01, ge=0, le=1, description="share of the rate that is left for what is known"
     )
     learning_rate_s: float = Field(
         8.0, gt=0, description="algebraic tier: share that is learnt in a second"
@@ -135,6 +135,7 @@ class SSPSLAMConfig(Section):
     )
     binding_neurons: int = Field(50, ge=2, description="of each product of two numbers")
     vector_neurons: int = Field(550, ge=0, description="object-vector cells; 0: exact")
+    vector_reach_m: float = Field(0.3, gt=0, description="how far object-vector cells reach")
     places: bool = Field(False, description="learn what is at places, too: areas can be asked for")
     grid_neurons: int = Field(0, ge=0, description="grid cells that say the position; 0: exact")
     attention: Literal["sum", "nearest", "turns"] = Field(
@@ -147,5 +148,5 @@ class SSPSLAMConfig(Section):
         0.5, ge=0, description="of a known landmark that contradicts, then it is believed; 0: never"
     )
     quantised: bool = Field(
-        False, description="weights of 8 bits, a chip's neurons, no function outside neurons"
+        False, description="weights of 8 bits, neurons of a chip, no function outside of them"
     )

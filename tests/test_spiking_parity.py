@@ -85,7 +85,9 @@ def integrator_run(shared):
 def replayed(ref):
     """The reference's network: 27 oscillators, and a population for the constant term."""
     space = SSPSpace(as_tensor(ref["A"][1:28]), float(ref["length_scale"]))
-    walk = PathIntegrator(space, PathIntegratorConfig(neurons=50, tau_s=0.05), NeuronConfig(), 1e-3).double()
+    walk = PathIntegrator(
+        space, PathIntegratorConfig(neurons=50, tau_s=0.05), NeuronConfig(), 1e-3
+    ).double()
     encoders, bias = ref["scaled_encoders"], ref["bias"].copy()
     bias[0] += encoders[0, :, 0]  # its constant input is 1, 0, 0
     put(walk.neurons, encoders, bias, ref["v0"])

@@ -146,7 +146,11 @@ class AlgebraicMap(Running):
     @torch.no_grad()
     def read(self, keys: Tensor) -> Tensor:
         """Return what is recalled, ``(n, n_key)`` to ``(batch, n, n_value)``."""
-        return keys.to(self.weights) @ self.weights.mT
+        return self.respond(keys) @ self.weights.mT
+
+    def respond(self, keys: Tensor) -> Tensor:
+        """Return the keys themselves, for every animal: what the memory's cells stand for."""
+        return keys.to(self.weights).expand(len(self.weights), -1, -1)
 
     @torch.no_grad()
     def write(self, keys: Tensor, values: Tensor) -> None:

@@ -165,8 +165,12 @@ class AssociativeMap(Running):
         Returns:
             ``(batch, n, n_value)``.
         """
+        return self.respond(keys) @ self.decoders
+
+    def respond(self, keys: Tensor) -> Tensor:
+        """Return the rates of the memory to keys, ``(batch, n, neurons)``."""
         current = self.memory.bias + keys.to(self.encoders) @ self.encoders.mT
-        return rates(current, self.memory.config, self.time_step_s) @ self.decoders
+        return rates(current, self.memory.config, self.time_step_s)
 
     @torch.no_grad()
     def write(self, keys: Tensor, values: Tensor) -> None:
@@ -180,8 +184,7 @@ class AssociativeMap(Running):
             keys: ``(n, n_key)``.
             values: ``(n, n_value)``.
         """
-        current = self.memory.bias + keys.to(self.encoders) @ self.encoders.mT
-        a = rates(current, self.memory.config, self.time_step_s).double()
+        a = self.respond(keys).double()
         gram = a @ a.mT
         ridge = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
         gram = gram + ridge * torch.eye(len(keys), dtype=gram.dtype, device=gram.device)

@@ -143,7 +143,8 @@ class NeuronArray(Running):
 
     :func:`neuroslam.spiking.neurons.lif_step` has the mathematics. Groups lead and animals come
     second, so that one batched matrix product serves all of them. State: ``weights`` (encoders with
-    gain), ``bias``, and what each neuron carries, ``deficit`` and ``asleep``.
+    gain), ``bias``, and what each neuron carries, ``deficit`` and ``asleep``. What fired in the
+    last step is in ``spikes``, for who watches.
 
     Args:
         tuning: What the neurons respond to.
@@ -164,6 +165,7 @@ class NeuronArray(Running):
     bias: Tensor
     deficit: Tensor
     asleep: Tensor
+    spikes: Tensor
 
     def __init__(
         self,
@@ -184,6 +186,7 @@ class NeuronArray(Running):
         state = resting(start.contiguous())
         self.register_buffer("deficit", state.deficit)
         self.register_buffer("asleep", state.asleep)
+        self.register_buffer("spikes", torch.zeros_like(state.deficit), persistent=False)
 
     @property
     def charged(self) -> float:
@@ -234,6 +237,7 @@ class NeuronArray(Running):
         state = LIFState(self.deficit, self.asleep)
         state, fired = step(state, drive, self.membrane, self.time_step_s)
         self.deficit, self.asleep = state
+        self.spikes = fired
         return fired
 
     def silence(self) -> None:

@@ -1,7 +1,5 @@
 """Grid, place and object-vector cells: neurons whose encoders are spatial semantic pointers."""
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -59,9 +57,9 @@ class VectorPopulation(Running):
         super().__init__()
         self.time_step_s = time_step_s
         config = config.model_copy(update={"intercept": _INTERCEPTS})
-        # The dot product of two real vectors, in terms of their coefficients (Parseval).
-        size = (1.0 + 2.0 * encoders.abs().square().sum(-1, keepdim=True)).sqrt()
-        scale = 1.0 / (size * math.sqrt(space.n_features))
+        # The dot product of two real vectors, in terms of their coefficients (Parseval), over what
+        # it is at most: a module alone, too, fires at its highest rate where its waves meet.
+        scale = 1.0 / (1.0 + 2.0 * encoders.abs().square().sum(-1, keepdim=True))
         weights = 2.0 * scale * torch.view_as_real(encoders).flatten(-2)
         n = len(encoders)
         tuning = sample_tuning(1, n, weights.shape[-1], config, draw, encoders=weights[None])

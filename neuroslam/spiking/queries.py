@@ -14,6 +14,7 @@ from neuroslam.spiking.space import SSPSpace
 _LEAST_STRENGTH = 0.4  # of what is left, in which one more place is looked for
 _MOST_PLACES = 50
 _REFINEMENTS = 12
+_BOX_POINTS = 64
 _TWO = 1.4  # strength from which on a place may be two
 
 
@@ -146,8 +147,8 @@ def what(
     r"""Return how much of each landmark lies in a box; about 1 inside, 0.5 on its edge, 0 outside.
 
     The box's vector, :math:`R = \text{mean}_{x \in D}\,\phi(x)`, is the key of the map from places
-    to pointers. Inside, :math:`\phi \cdot R` is :math:`\lVert R \rVert^2` on average, whatever the
-    size of the box, so that is what an answer is measured by.
+    to pointers. A landmark in it is recalled as strongly as the memory answers alike to this key
+    and to the landmark's own place; an answer is measured by the mean of that over the box.
 
     Args:
         slam: Whose map of places learns (``places`` in its config).
@@ -167,9 +168,14 @@ def what(
             f"corner of {slam.space.dimension} numbers each"
         )
     vector = slam.space.from_fourier(slam.space.region_fourier(box[0], box[1])).detach()
-    size = vector.norm()
-    said = slam.places.read((vector / size).unsqueeze(0))[animal, 0]
-    amounts = slam.pointers @ said / slam.pointers.square().sum(-1) / size
+    key = (vector / vector.norm()).unsqueeze(0)
+    share = torch.quasirandom.SobolEngine(len(box[0])).draw(_BOX_POINTS).to(box)
+    inside = slam.space.encode(box[0] + (box[1] - box[0]) * share).detach()
+    with torch.no_grad():
+        whole, each = (slam.places.respond(k)[animal] for k in (key, inside))
+        alike = (each @ whole[0] / each.square().sum(-1).clamp_min(1e-12)).mean()
+    said = slam.places.read(key)[animal, 0]
+    amounts = slam.pointers @ said / slam.pointers.square().sum(-1) / alike.clamp_min(1e-6)
     return dict(zip(slam.names, amounts.tolist(), strict=True))
 
 
@@ -199,3 +205,18 @@ def whole_map(slam: SSPSLAM, animal: int = 0) -> Tensor:
     places = torch.fft.rfft(slam.map.read(slam.pointers)[animal])
     pointers = torch.fft.rfft(slam.pointers)
     return torch.fft.irfft((places * pointers).sum(0), n=slam.space.n_features)
+
+
+def landmarks_in(
+    slam: SSPSLAM, low_m: Sequence[float], high_m: Sequence[float], animal: int = 0
+) -> dict[str, tuple[float, ...]]:
+    """Return the landmarks that are recalled to places in a box, with these places.
+
+    Sharper at the edges than :func:`what`, and as many recalls as there are landmarks.
+    """
+    z = slam.space.to_fourier(slam.map.read(slam.pointers)[animal])
+    known = z.abs().square().mean(-1).sqrt() > _LEAST_STRENGTH
+    at = PositionDecoder(slam.space)(z).position_m
+    low, high = torch.tensor([list(low_m), list(high_m)]).to(at)
+    inside = known & ((at >= low) & (at <= high)).all(-1)
+    return {name: tuple(at[k].tolist()) for k, name in enumerate(slam.names) if inside[k]}

@@ -16,17 +16,20 @@ from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, region_vectors
 from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
+from neuroslam.spiking.correction import SpikingCorrection
 from neuroslam.spiking.ensemble import lowpass, synapse
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
+from neuroslam.spiking.quantise import quantised
 from neuroslam.spiking.space import SSPSpace
 
 _CHUNK = 200  # steps whose inputs are prepared at once
 _GATE_WIDTH = 0.02  # of similarity, over which the gate opens
 _KNOWN = 0.5  # strength of a recall from which a landmark counts as known
 _SETTLED_S = 0.15  # of a landmark, before neurons say it and its place is learnt
-_CLEARLY = 0.3  # of similarity above the gate, where a landmark agrees beyond doubt
+_AREA_INTERCEPT = 0.05  # similarity at which cells of the memory of places fire
+_CONTRADICTS, _AGREES = 0.5, 0.7  # of similarity; side lobes of a space are below the first
 _LOST_GAIN = 1.0  # of what the map says, to one who is lost
 
 
@@ -97,11 +100,12 @@ class SSPSLAM(Running):
         batch: int = 1,
     ) -> None:
         super().__init__()
+        config = on_chip(config) if config.quantised else config
         self.config = config
         self.batch = batch
         self.names = tuple(names or (str(k) for k in range(len(pointers))))
-        self.space = SSPSpace.from_config(config.space)
-        c, dt, seed, n = config, config.time_step_s, config.seed, self.space.n_features
+        space = SSPSpace.from_config(config.space)
+        c, dt, seed, n = config, config.time_step_s, config.seed, space.n_features
         if pointers.ndim != 2 or pointers.shape[1] != n:
             raise SpaceError(
                 f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n}); "
@@ -117,19 +121,19 @@ class SSPSLAM(Running):
             neurons = neurons.model_copy(update={"model": "lif_rate"})
         self.register_buffer("pointers", pointers.detach().float().clone())
         if c.tier == "algebraic":
-            self.integrator = AlgebraicIntegrator(self.space, c.integrator, dt, seed, batch)
+            self.integrator = AlgebraicIntegrator(space, c.integrator, dt, seed, batch)
             self.map = AlgebraicMap(n, n, c.map, dt, batch)
             self.places = AlgebraicMap(n, n, c.map, dt, batch) if c.places else None
             self.vectors = self.grid = self.binding = self.unbinding = None
         else:
-            self.integrator = PathIntegrator(self.space, c.integrator, neurons, dt, seed, batch)
+            self.integrator = PathIntegrator(space, c.integrator, neurons, dt, seed, batch)
             keys = self.pointers if c.map.voja_rate == 0 else None
             self.map = AssociativeMap(n, n, c.map, neurons, dt, seed + 1, batch, keys)
             self.places = self._place_memory(neurons, seed + 6) if c.places else None
             self.vectors = self.grid = None
             if c.vector_neurons:
                 self.vectors = VectorPopulation.of_objects(
-                    self.space, c.vector_neurons, neurons, dt, seed + 2, batch
+                    self.space, c.vector_neurons, neurons, dt, seed + 2, batch, c.vector_reach_m
                 )
             if c.grid_neurons:
                 self.grid = VectorPopulation.of_grid_cells(
@@ -141,6 +145,14 @@ class SSPSLAM(Running):
                 self.unbinding = SpikingBinding(k, size, neurons, dt, seed + 5, batch)
             else:
                 self.binding = self.unbinding = None
+        self.correction = None
+        if c.quantised:
+            self.correction = SpikingCorrection(
+                space.n_frequencies, c.map.neurons, c.binding_neurons, c.gate, neurons, dt,
+                seed + 7, batch,
+            )  # fmt: skip
+            for name, part in self.parts.items():
+                setattr(self, name, quantised(part))
         self.gate = nn.Parameter(torch.tensor(c.gate), requires_grad=False)
         self.gain = nn.Parameter(torch.tensor(c.gain), requires_grad=False)
         self.register_buffer("time_s", torch.zeros((), dtype=torch.float64))
@@ -152,6 +164,11 @@ class SSPSLAM(Running):
             self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
 
     @property
+    def space(self) -> SSPSpace:
+        """Of the positions; it belongs to the path integrator."""
+        return self.integrator.space
+
+    @property
     def n_neurons(self) -> int:
         """Of one animal, in all populations."""
         return sum(part.n_neurons for part in self.parts.values())
@@ -159,14 +176,18 @@ class SSPSLAM(Running):
     @property
     def parts(self) -> dict[str, nn.Module]:
         """Populations that it has, by name."""
-        names = ("integrator", "map", "places", "vectors", "grid", "binding", "unbinding")
+        names = (
+            "integrator", "map", "places", "vectors", "grid", "binding", "unbinding", "correction",
+        )  # fmt: skip
         return {name: part for name in names if (part := getattr(self, name)) is not None}
 
     def start(self, position_m: Tensor) -> None:
         """Tell it where it is, ``(batch, dimension)``; what it has learnt stays."""
         position = self._positions(position_m)
         self.integrator.start(position)
-        self.contradicted_s = torch.zeros_like(self.contradicted_s)
+        for name in ("contradicted_s", "held_s", "familiar", "pull"):
+            setattr(self, name, torch.zeros_like(getattr(self, name)))
+        self.attended = torch.full_like(self.attended, NOTHING)
 
     def forward(self, velocity_m_s: Tensor, view: LandmarkView | None = None) -> SSPStep:
         """Live one step; gradients reach the space, ``gate`` and ``gain``.
@@ -221,7 +242,7 @@ class SSPSLAM(Running):
         settled = held_s > (1.5 * c.time_step_s if c.tier == "algebraic" else _SETTLED_S)
         z = self.integrator(velocity, torch.view_as_complex(self.pull))
         # Where the landmark is: the position, cleaned up, moved by the vector to it.
-        here = space.encode_fourier(self.integrator.position_m)
+        here = z if c.quantised else space.encode_fourier(self.integrator.position_m)
         if self.grid is not None:
             here = self.grid(here)
         if self.vectors is not None:
@@ -230,11 +251,14 @@ class SSPSLAM(Running):
         place = here * vector if self.binding is None else self.binding(here, vector)
         strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
         lost = self._is_lost()
-        plasticity = (settled & ~lost).to(key) * self._plasticity(strength)
+        # Who is in doubt learns nothing: a map is not bent to where one who is lost believes to be.
+        doubts = (self.contradicted_s > 0) & (c.relocalise_after_s > 0)
+        learns = seen if c.quantised else (settled & ~doubts).to(key)
+        plasticity = learns * self._plasticity(strength)
         place = space.from_fourier(place)
         recall = space.to_fourier(self.map(key, place, seen, plasticity))
         if self.places is not None:
-            self.places(place * seen.unsqueeze(-1), key, seen, (settled & ~lost).to(key))
+            self.places(place * seen.unsqueeze(-1), key, seen, learns)
         # Where that puts the animal: what is recalled, moved back by the vector to it.
         told = recall * vector.conj()
         if self.unbinding is not None:
@@ -248,7 +272,11 @@ class SSPSLAM(Running):
         self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
         unit = told / told.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
-        self.pull = torch.view_as_real(gain.unsqueeze(-1) * (unit - here))
+        apart = unit - here
+        if self.correction is not None:
+            gain, apart = self.gain.expand(self.batch), self.correction(told, here, seen)
+            gate = 1.0 - self.correction.veto.clamp(0.0, 1.0)
+        self.pull = torch.view_as_real(gain.unsqueeze(-1) * apart)
         self.recalled = torch.view_as_real(recall)
         self.time_s = self.time_s + c.time_step_s
         self.attended, self.held_s, self.familiar = attended, held_s, familiar
@@ -261,7 +289,9 @@ class SSPSLAM(Running):
         low, high = self.space.bounds_m.T.float()
         at = low + (high - low) * torch.rand(c.map.neurons, len(low), generator=draw)
         n, keys = self.space.n_features, self.space.encode(at).detach()
-        config = c.map.model_copy(update={"voja_rate": 0.0})
+        # An area is like each of its places a little: cells must answer to that.
+        low = {"voja_rate": 0.0, "intercept": min(c.map.intercept, _AREA_INTERCEPT)}
+        config = c.map.model_copy(update=low)
         return AssociativeMap(n, n, config, neurons, c.time_step_s, seed, self.batch, keys)
 
     def _late(self, name: str, z: Tensor, tau_s: float) -> Tensor:
@@ -286,12 +316,9 @@ class SSPSLAM(Running):
 
     def _note_contradiction(self, known: Tensor, agreement: Tensor) -> None:
         """Count for how long known landmarks contradict; one that clearly agrees ends it."""
-        longer = torch.where(
-            agreement < self.gate,
-            self.contradicted_s + self.config.time_step_s,
-            self.contradicted_s,
-        )
-        longer = torch.where(agreement > self.gate + _CLEARLY, 0.0, longer)
+        more = self.contradicted_s + self.config.time_step_s
+        longer = torch.where(agreement < _CONTRADICTS, more, self.contradicted_s)
+        longer = torch.where(agreement > _AGREES, 0.0, longer)
         self.contradicted_s = torch.where(known, longer, self.contradicted_s).detach()
 
     def _inputs(self, velocity: Tensor, view: LandmarkView | None) -> tuple[Tensor, Sight]:
@@ -369,6 +396,25 @@ class SSPSLAM(Running):
                 f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
             )
         return position
+
+
+def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
+    """Leave out what a chip cannot do: all that is a function outside of neurons."""
+    if config.tier != "spiking":
+        raise SpaceError(
+            f"SSPSLAM: quantised neurons spike, but the tier is {config.tier!r}; set tier to "
+            "'spiking'"
+        )
+    return config.model_copy(
+        update={
+            "neurons": config.neurons.model_copy(update={"model": "stepped_lif"}),
+            "integrator": config.integrator.model_copy(update={"coupling": "none"}),
+            "map": config.map.model_copy(update={"voja_rate": 0.0, "plasticity": "constant"}),
+            "binding": "neurons",
+            "vector_neurons": config.vector_neurons or config.map.neurons,
+            "relocalise_after_s": 0.0,
+        }
+    )
 
 
 def _boxes_of(view: LandmarkView, n_landmarks: int) -> tuple[Tensor, Tensor]:

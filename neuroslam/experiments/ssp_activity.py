@@ -1,0 +1,247 @@
+"""What the neurons of SSP-SLAM do while a rat's path is walked: grid cells and the others."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuroslam.errors import SourceError
+from neuroslam.evaluation.gridness import gridness
+from neuroslam.evaluation.ratemap import Bins, RateMaps
+from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.experiments.ssp_lives import slam_in, views
+from neuroslam.plotting import save
+from neuroslam.semantic_sections import (
+    PathIntegratorConfig,
+    SemanticMapConfig,
+    SSPSLAMConfig,
+    SSPSpaceConfig,
+)
+from neuroslam.sensors.landmark_paths import LandmarkPath, path_of_walk
+from neuroslam.sensors.landmarks import LandmarkWorld, random_world
+from neuroslam.sensors.rodent import read_walk
+from neuroslam.spike_drawing import Headings, Spikes, plot_rasters, plot_signals, plot_spikes
+from neuroslam.spiking.slam import SSPSLAM
+
+_BIN_M = 0.05
+_PIECE = 1000
+_HEADINGS = 16
+_RASTER_S = 1.0
+_PER_RASTER = 120  # neurons
+
+OURS = PathIntegratorConfig(neurons=640, max_speed_m_s=1.5)
+REFERENCE = OURS.model_copy(
+    update={
+        "neurons": 500,
+        "tau_s": 0.05,
+        "amplitude_range": (0.0, 2.0**0.5),
+        "decoder_noise": 0.1,
+        "coupling": "none",
+    }
+)
+LIVES = {
+    "ours, corrected": (OURS, True),
+    "ours, path integration": (OURS, False),
+    "reference's oscillators, corrected": (REFERENCE, True),
+    "reference's oscillators, path integration": (REFERENCE, False),
+}
+"""Name -> oscillators, and whether the map corrects them."""
+
+
+class Watched:
+    """Spikes of a life: rate maps of grid cells, and all spikes of a few others."""
+
+    def __init__(self, slam: SSPSLAM, path: LandmarkPath, bins: Bins) -> None:
+        n = slam.grid.n_neurons
+        self.slam, self.path = slam, path
+        self.maps = RateMaps(bins, n)
+        self.half: np.ndarray | None = None
+        self.spikes: dict[str, list[np.ndarray]] = {p: [] for p in populations(slam)}
+        self.errors: list[float] = []
+        self.signals: list[tuple[float, float, float]] = []
+        self._fired: list[np.ndarray] = []
+
+    def __call__(self, step: int, said: Any) -> None:  # noqa: ANN401 - a step of SSP-SLAM
+        """Take a step."""
+        fired = {name: array.spikes for name, array in populations(self.slam).items()}
+        self._fired.append(fired["grid cells"][0, 0].numpy().astype(bool))
+        for name, kept in self.spikes.items():
+            kept.append(_some(fired[name]).numpy().astype(bool))
+        at = self.path.position_m[step]
+        self.errors.append(float(np.linalg.norm(said.position_m[0].numpy() - at)))
+        self.signals.append(tuple(float(x[0]) for x in (said.agreement, said.gate, said.recall)))
+        n, whole = step + 1, len(self.path.position_m)
+        if n % _PIECE == 0 or n == whole:
+            rate = np.stack(self._fired) / self.path.time_step_s
+            self.maps.add(self.path.position_m[n - len(rate) : n], rate)
+            self._fired = []
+        if self.half is None and n >= whole / 2:
+            self.half = gridness(self.maps.maps())
+
+
+def populations(slam: SSPSLAM) -> dict[str, Any]:
+    """Return the arrays of neurons that are looked at, by name."""
+    return {
+        "grid cells": slam.grid.neurons,
+        "object-vector cells": slam.vectors.neurons,
+        "memory": slam.map.memory,
+        "oscillators": slam.integrator.neurons,
+    }
+
+
+def _some(spikes: torch.Tensor) -> torch.Tensor:
+    """Spikes of a few neurons, evenly over all groups."""
+    flat = spikes[:, 0].flatten()
+    return flat[torch.linspace(0, len(flat) - 1, _PER_RASTER).long()]
+
+
+def ssp_activity(
+    data_folder: Path, out_folder: Path, seconds: float = 150.0, grid_neurons: int = 450
+) -> dict[str, Any]:
+    """Watch neurons along a rat's path, with and without corrections by the map (Fig. 7).
+
+    The path is the one by Sargolini and others that comes with RatInABox, where that is installed,
+    else the one in the data.
+
+    Args:
+        data_folder: With recordings of rats.
+        out_folder: ``results.json``, ``spikes.png``, ``rasters.png`` and ``gate.png`` are written
+            there.
+        seconds: How long; the paper has 150.
+        grid_neurons: How many grid cells.
+
+    Returns:
+        The content of ``results.json``: ``rows``, one for each life.
+    """
+    out = Path(out_folder)
+    path, source = rat_path(data_folder, seconds)
+    world = random_world(10, seed=3)
+    bins = Bins.around(np.array([[-0.9, -0.9], [0.9, 0.9]]), _BIN_M)
+    rows, watched = [], {}
+    for name, (oscillators, corrected) in LIVES.items():
+        slam = slam_in(_config(oscillators, corrected, grid_neurons), world)
+        seen = watched[name] = Watched(slam, path, bins)
+        _walk(slam, world, path, seen)
+        score = gridness(seen.maps.maps())
+        error = np.array(seen.errors)
+        rows.append(
+            {
+                "life": name,
+                "gridness_median_half": _median(seen.half),
+                "gridness_median": _median(score),
+                "cells_scored": int(np.isfinite(score).sum()),
+                "ate_m": float(error.mean()),
+                "error_last_10_s_m": float(error[-round(10 / path.time_step_s) :].mean()),
+            }
+        )
+    _draw(watched, world, path, out)
+    return write_results(out, {"path": source, "seconds": seconds, "rows": rows})
+
+
+def rat_path(data_folder: Path, seconds: float) -> tuple[LandmarkPath, str]:
+    """Return a rat's path in a box, and whose it is."""
+    spec = find_spec("ratinabox")
+    file = Path(data_folder) / "sargolini2006_circle1m.npz"
+    if spec is not None and spec.origin is not None:
+        packaged = Path(spec.origin).parent / "data" / "sargolini.npz"
+        file = packaged if packaged.is_file() else file
+    if not file.is_file():
+        raise SourceError(f"{file}: no such recording; install neuroslam[rodent], or give --data")
+    walk = read_walk(file, rate_hz=50.0)
+    return path_of_walk(walk).first(seconds), file.name
+
+
+def _config(oscillators: PathIntegratorConfig, corrected: bool, grid_neurons: int) -> SSPSLAMConfig:
+    more = {} if corrected else {"gain": 0.0, "relocalise_after_s": 0.0}
+    return SSPSLAMConfig(
+        space=SSPSpaceConfig(length_scale_m=0.15),
+        integrator=oscillators,
+        map=SemanticMapConfig(voja_rate=5e-4),
+        binding="exact",
+        grid_neurons=grid_neurons,
+        **more,
+    )
+
+
+def _walk(slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath, watch: Watched) -> None:
+    slam.start(torch.from_numpy(path.position_m[:1]))
+    slam.run(
+        torch.from_numpy(path.velocity_m_s[:, None]),
+        views([world], path.position_m[:, None]),
+        watch,
+        every=1000,
+    )
+
+
+def _median(scores: np.ndarray) -> float:
+    scores = scores[np.isfinite(scores)]
+    return float(np.median(scores)) if len(scores) else float("nan")
+
+
+def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath, out: Path) -> None:
+    """Draw spikes on the path as the paper's Fig. 7 does, rasters, and the gate."""
+    at, dt = path.position_m, path.time_step_s
+    landmarks = np.array([m.position_m for m in world.landmarks])
+    fine = at[:: max(1, round(0.02 / dt))]
+    on, off = (watched[f"reference's oscillators, {k}"] for k in ("corrected", "path integration"))
+    scores = gridness(on.maps.maps())
+    cells = np.linspace(0, on.slam.grid.n_neurons - 1, _PER_RASTER).astype(int)
+    best = int(np.nanargmax(np.where(np.isfinite(scores[cells]), scores[cells], -2.0)))
+    rows: list[list[Spikes | Headings]] = []
+    for life, label in ((on, "corrected by the map"), (off, "path integration alone")):
+        fired = np.stack(life.spikes["grid cells"])[:, best]
+        score = gridness(life.maps.maps())[cells[best]]
+        half = fired[: len(fired) // 2]
+        rows.append(
+            [
+                Spikes("Grid cell, first half", label, fine, at[: len(half)][half]),
+                Spikes("The same, whole time", f"gridness {score:.2f}", fine, at[fired]),
+            ]
+        )
+    ours = watched["ours, corrected"]
+    for name, title in (("object-vector cells", "Object-vector cell"), ("memory", "Memory neuron")):
+        spikes = np.stack(ours.spikes[name])
+        k = int(np.argsort(spikes.sum(0))[int(0.9 * spikes.shape[1])])
+        rows[0 if name.startswith("object") else 1].append(
+            Spikes(title, f"{spikes[:, k].sum()} spikes", fine, at[spikes[:, k]], landmarks)
+        )
+    spikes = np.stack(ours.spikes["oscillators"])
+    velocity = path.velocity_m_s
+    moving = np.linalg.norm(velocity, axis=-1) > 0.05
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0]) % (2 * np.pi)
+    bins = np.minimum((heading / (2 * np.pi) * _HEADINGS).astype(int), _HEADINGS - 1)
+    time = np.bincount(bins[moving], minlength=_HEADINGS) * dt
+    rates = np.stack(
+        [np.bincount(bins[moving], s[moving], _HEADINGS) / time.clip(dt) for s in spikes.T]
+    )
+    k = int(
+        np.argmax(np.abs((rates * np.exp(2j * np.pi * np.arange(_HEADINGS) / _HEADINGS)).sum(1)))
+    )
+    some = spikes[:, k].nonzero()[0]
+    rows[0].append(Spikes("Oscillator neuron", f"{len(some)} spikes", fine, at[some[:4000]]))
+    rows[1].append(Headings("Its rate (Hz) by heading", rates[k]))
+    title = "Neurons along a rat's path: dots where they fired, crosses landmarks"
+    save(plot_spikes(rows, title), out / "spikes.png")
+    n = round(_RASTER_S / dt)
+    begin = int(np.argmax(np.array(ours.signals)[:, 2] > 0.5))
+    save(
+        plot_rasters(
+            {name: np.stack(s[begin : begin + n]) for name, s in ours.spikes.items()},
+            dt,
+            begin * dt,
+            "Who fires when, as a known landmark comes into view",
+        ),
+        out / "rasters.png",
+    )
+    signals = np.array(ours.signals)[:: max(1, round(0.01 / dt))]
+    names = ("agreement", "gate", "recall")
+    save(
+        plot_signals(
+            np.arange(len(signals)) * 0.01,
+            {name: signals[:, i] for i, name in enumerate(names)},
+            "Loop closure: agreement of map and path, gate, strength of what is recalled",
+        ),
+        out / "gate.png",
+    )
