@@ -12,7 +12,7 @@ FLOW = [
     "storage", "checked_files", "population", "vision",
     "sensors", "odometry", "view", "cells", "spiking", "mapping", "brain",
     "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "spike_drawing",
-    "semantic_drawing", "cell_panels",
+    "semantic_drawing", "cell_panels", "semantic_panels",
     "merge_drawing", "recording", "run_files",
     "inspection", "export",
     "review", "runs", "merging", "demo",

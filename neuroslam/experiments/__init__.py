@@ -25,9 +25,17 @@ EXPERIMENTS = {
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
     "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
+    "ssp-map": ("neuroslam.experiments.ssp_map", "ssp_map", None),
+    "ssp-activity": ("neuroslam.experiments.ssp_activity", "ssp_activity", "rodent"),
+    "ssp-localisation": ("neuroslam.experiments.ssp_localisation", "ssp_localisation", None),
+    "ssp-3d": ("neuroslam.experiments.ssp_localisation", "ssp_3d", None),
+    "ssp-kitti": ("neuroslam.experiments.ssp_kitti", "ssp_kitti", "kitti_00"),
     "threshold-sweep": ("neuroslam.experiments.place_cells", "threshold_sweep", "rodent"),
 }
 """Name -> module, function, folder of its recordings in the data; ``None``: it needs none."""
+
+_IF_THERE = {"ssp-localisation": "ssp"}
+"""Name -> folder of recordings that are used if they are there; else random ones like them."""
 
 
 def run_experiment(name: str, data: Path | None, out: Path) -> list[dict[str, Any]]:
@@ -45,6 +53,9 @@ def run_experiment(name: str, data: Path | None, out: Path) -> list[dict[str, An
         raise RunError(f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}")
     module, function, folder = EXPERIMENTS[name]
     recordings = None
+    if folder is None and data is not None and name in _IF_THERE:
+        wanted = Path(data) / _IF_THERE[name]
+        recordings = wanted if wanted.is_dir() else None
     if folder is not None:
         if data is None:
             raise RunError(f"{name}: needs a recording; say with --data which folder holds it")

@@ -185,7 +185,7 @@ def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath,
     at, dt = path.position_m, path.time_step_s
     landmarks = np.array([m.position_m for m in world.landmarks])
     fine = at[:: max(1, round(0.02 / dt))]
-    on, off = (watched[f"reference's oscillators, {k}"] for k in ("corrected", "path integration"))
+    on, off = (watched[f"ours, {k}"] for k in ("corrected", "path integration"))
     scores = gridness(on.maps.maps())
     cells = np.linspace(0, on.slam.grid.n_neurons - 1, _PER_RASTER).astype(int)
     best = int(np.nanargmax(np.where(np.isfinite(scores[cells]), scores[cells], -2.0)))

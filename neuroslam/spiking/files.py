@@ -23,7 +23,7 @@ def save_semantic_map(slam: SSPSLAM, path: str | Path) -> None:
     about = {
         "format": FORMAT_VERSION,
         "kind": _KIND,
-        "config": slam.config.model_dump(mode="json"),
+        "config": slam.given.model_dump(mode="json"),
         "names": list(slam.names),
         "batch": slam.batch,
     }

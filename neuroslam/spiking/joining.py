@@ -138,7 +138,7 @@ def _written(
     pointers = dict(zip(loaded.names, loaded.pointers, strict=True))
     for name, pointer in zip(partial.names, partial.pointers, strict=True):
         pointers.setdefault(name, pointer)
-    merged = SSPSLAM(loaded.config, torch.stack(list(pointers.values())), list(pointers))
+    merged = SSPSLAM(loaded.given, torch.stack(list(pointers.values())), list(pointers))
     state = partial.state_dict()
     for prefix in ("map.", "places."):
         state |= {k: v for k, v in loaded.state_dict().items() if k.startswith(prefix)}

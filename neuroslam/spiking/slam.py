@@ -28,6 +28,7 @@ _CHUNK = 200  # steps whose inputs are prepared at once
 _GATE_WIDTH = 0.02  # of similarity, over which the gate opens
 _KNOWN = 0.5  # strength of a recall from which a landmark counts as known
 _SETTLED_S = 0.15  # of a landmark, before neurons say it and its place is learnt
+_TUNED_TO_KEYS = 20.0  # power of rates to a key, of neurons tuned to it over others
 _AREA_INTERCEPT = 0.05  # similarity at which cells of the memory of places fire
 _CONTRADICTS, _AGREES = 0.5, 0.7  # of similarity; side lobes of a space are below the first
 _LOST_GAIN = 1.0  # of what the map says, to one who is lost
@@ -100,8 +101,8 @@ class SSPSLAM(Running):
         batch: int = 1,
     ) -> None:
         super().__init__()
-        config = on_chip(config) if config.quantised else config
-        self.config = config
+        self.given = config
+        self.config = config = on_chip(config) if config.quantised else config
         self.batch = batch
         self.names = tuple(names or (str(k) for k in range(len(pointers))))
         space = SSPSpace.from_config(config.space)
@@ -409,7 +410,13 @@ def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
         update={
             "neurons": config.neurons.model_copy(update={"model": "stepped_lif"}),
             "integrator": config.integrator.model_copy(update={"coupling": "none"}),
-            "map": config.map.model_copy(update={"voja_rate": 0.0, "plasticity": "constant"}),
+            "map": config.map.model_copy(
+                update={
+                    "voja_rate": 0.0,
+                    "plasticity": "constant",
+                    "pes_rate": config.map.pes_rate / _TUNED_TO_KEYS,
+                }
+            ),
             "binding": "neurons",
             "vector_neurons": config.vector_neurons or config.map.neurons,
             "relocalise_after_s": 0.0,

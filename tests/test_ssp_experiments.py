@@ -1,0 +1,66 @@
+"""Experiments of SSP-SLAM run, small, and their figures are there."""
+
+import json
+
+import pytest
+
+from neuroslam.experiments import run_experiment
+from neuroslam.experiments.ssp_activity import ssp_activity
+from neuroslam.experiments.ssp_kitti import ssp_kitti
+from neuroslam.experiments.ssp_localisation import ssp_3d, ssp_localisation
+from neuroslam.experiments.ssp_map import ssp_map
+
+
+def pictures(folder):
+    return {p.name for p in folder.glob("*.png") if p.stat().st_size > 10_000}
+
+
+def test_a_map_is_asked_and_random_ones_are_counted(tmp_path):
+    found = ssp_map(None, tmp_path, seconds=40.0, tier="algebraic", n_random_maps=3)
+    rows = {row["question"]: row for row in found["rows"]}
+    assert rows["landmark, random maps"]["right"] == rows["landmark, random maps"]["landmarks"] > 10
+    assert rows["attribute, random maps"]["right"] >= 2
+    assert json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["rows"]
+    assert pictures(tmp_path) == {
+        "queries.png", "vectors.png", "area.png", "whole_map.png", "posterior.png",
+    }  # fmt: skip
+
+
+def test_localisation_is_better_with_a_map_under_noise(tmp_path):
+    methods = ("algebraic", "algebraic, phase noise 0.3")
+    rows = ssp_localisation(None, tmp_path, 90.0, n_trials=3, methods=methods)["rows"]
+    assert max(row["ate_mean_m"] for row in rows if row["method"] == "algebraic") < 1e-3
+    alone, same, _ = (row["ate_mean_m"] for row in rows if row["method"] == methods[1])
+    assert same < alone
+    assert pictures(tmp_path) == {"errors.png", "paths.png"}
+
+
+def test_the_reference_s_paths_are_used_where_they_are(shared, tmp_path, monkeypatch):
+    from neuroslam.experiments import ssp_localisation as module
+
+    monkeypatch.setattr(module, "trials", lambda data, *_: pytest.fail(str(data)))
+    with pytest.raises(pytest.fail.Exception, match=r"refs/ssp"):
+        run_experiment("ssp-localisation", shared / "refs", tmp_path)
+
+
+def test_three_dimensions_are_like_two(tmp_path):
+    rows = ssp_3d(None, tmp_path, seconds=1.5, neurons=60, n_trials=1)["rows"]
+    assert [row["tier"] for row in rows] == ["algebraic"] * 2 + ["spiking"] * 2
+    assert rows[0]["ate_mean_m"] < 1e-3
+    assert pictures(tmp_path) == {"path.png"}
+
+
+def test_kitti_is_reckoned_plainly_and_as_on_a_chip(shared, tmp_path):
+    found = ssp_kitti(shared / "data" / "kitti_00", tmp_path, seconds=3.0, budgets=(3600,))
+    assert [row["integrator"] for row in found["rows"]] == [
+        "plain, 3k neurons", "quantised, 3k neurons",
+    ]  # fmt: skip
+    assert found["metres_per_unit"] > 200
+    assert pictures(tmp_path) == {"reckoning.png"}
+
+
+def test_neurons_are_watched_along_a_rat_s_path(shared, tmp_path):
+    rows = ssp_activity(shared / "data" / "rodent", tmp_path, seconds=1.5, grid_neurons=45)["rows"]
+    assert len(rows) == 4
+    assert rows[0]["ate_m"] < 0.05
+    assert pictures(tmp_path) == {"spikes.png", "rasters.png", "gate.png"}
