@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.ndimage import uniform_filter1d
 
 from neuroslam.drawing import CURVES, INK, LOOP, MAP, ODOMETRY, STYLE, new_figure, write_title
 
@@ -147,6 +148,8 @@ def plot_errors(
 ) -> Figure:
     """Draw errors over time, mean over trials with a band of their spread (the paper's Fig. 8).
 
+    Each is the mean over a second: what is said wavers with every spike.
+
     Args:
         time_s: ``(t,)``.
         panels: What an error is, with its unit -> method -> errors, ``(t, trials)``.
@@ -160,12 +163,16 @@ def plot_errors(
         for ax, (what, methods) in zip(axes, panels.items(), strict=True):
             for name, errors in methods.items():
                 colour = colours.setdefault(name, CURVES[len(colours) % len(CURVES)])
-                low, high = np.percentile(errors, (10, 90), axis=1)
+                width = max(1, round(1.0 / (time_s[1] - time_s[0])))
+                smooth = uniform_filter1d(errors, width, axis=0)
+                low, high = np.percentile(smooth, (10, 90), axis=1)
                 ax.fill_between(time_s, low, high, color=colour, alpha=_BAND, lw=0)
-                ax.plot(time_s, errors.mean(1), color=colour, lw=1.4, label=name)
+                ax.plot(time_s, smooth.mean(1), color=colour, lw=1.4, label=name)
             ax.set(xlabel="time (s)", ylabel=what, xlim=(0, time_s[-1]))
             if log:
-                ax.set_yscale("log")
+                ax.set_yscale("log", nonpositive="clip")
+                top = max(float(errors.max()) for errors in methods.values())
+                ax.set_ylim(1e-3 * top, 1.2 * top)
             write_title(ax, what.split(" (")[0].capitalize())
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))

@@ -26,6 +26,7 @@ def test_there_are_notebooks():
         "02_map_a_video",
         "03_two_sessions",
         "04_cells_of_a_rat",
+        "05_semantic_map",
     ]
 
 

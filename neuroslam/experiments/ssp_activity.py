@@ -190,14 +190,14 @@ def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath,
     cells = np.linspace(0, on.slam.grid.n_neurons - 1, _PER_RASTER).astype(int)
     best = int(np.nanargmax(np.where(np.isfinite(scores[cells]), scores[cells], -2.0)))
     rows: list[list[Spikes | Headings]] = []
-    for life, label in ((on, "corrected by the map"), (off, "path integration alone")):
+    for life, label in ((on, "Grid cell, map on"), (off, "Grid cell, map off")):
         fired = np.stack(life.spikes["grid cells"])[:, best]
         score = gridness(life.maps.maps())[cells[best]]
         half = fired[: len(fired) // 2]
         rows.append(
             [
-                Spikes("Grid cell, first half", label, fine, at[: len(half)][half]),
-                Spikes("The same, whole time", f"gridness {score:.2f}", fine, at[fired]),
+                Spikes(label, "first half", fine, at[: len(half)][half]),
+                Spikes("The same cell", f"whole time, gridness {score:.2f}", fine, at[fired]),
             ]
         )
     ours = watched["ours, corrected"]

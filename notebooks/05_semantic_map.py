@@ -1,0 +1,181 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A semantic map
+# An animal walks among landmarks that are something: a blue square, an orange triangle, a wall. Its
+# position is a vector whose waves its velocity turns; what it sees is bound to that vector and learnt.
+# Afterwards the map can be asked: where are the blue things, what is in this area, how far is it?
+# (SSP-SLAM; Dumont, Furlong, Orchard and Eliasmith 2023.)
+
+# %%
+# %matplotlib inline
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+from neuroslam.drawing import INK, MAP, STYLE
+from neuroslam.experiments.ssp_lives import integrate, live, pointers_of, slam_in, views
+from neuroslam.experiments.ssp_map import similarity_map
+from neuroslam.semantic_drawing import Query, plot_area, plot_queries
+from neuroslam.semantic_sections import PathIntegratorConfig, SemanticMapConfig, SSPSLAMConfig
+from neuroslam.sensors.landmark_paths import band_limited_path
+from neuroslam.sensors.landmarks import paper_world, random_world
+from neuroslam.spike_drawing import plot_rasters, plot_trials
+from neuroslam.spiking import PositionDecoder, SSPSpace, bind, queries
+from neuroslam.spiking.joining import merge_semantic_maps
+
+torch.set_num_threads(1)
+plt.rcParams.update(STYLE)
+
+# %% [markdown]
+# ## Positions as vectors
+# Binding two vectors adds their positions, so a map can be moved without being read. A vector is like
+# those of places nearby, with ripples: that is the width at which places are told apart.
+
+# %%
+space = SSPSpace.hexagonal(n_rotations=5, n_scales=5)
+here, step = torch.tensor([0.2, -0.1]), torch.tensor([0.3, 0.4])
+moved = bind(space.encode(here), space.encode(step))
+found = PositionDecoder(space)(space.to_fourier(moved).unsqueeze(0)).position_m[0]
+print("moved to", [round(x, 3) for x in found.tolist()])
+
+offset = torch.linspace(-1, 1, 201)
+across = torch.stack([offset, torch.zeros_like(offset)], dim=-1)
+figure, axes = plt.subplots(figsize=(6.5, 2.8), layout="constrained")
+axes.plot(offset, space.kernel(across), color=MAP)
+axes.axhline(0, color=INK, lw=0.6)
+axes.set(xlabel="distance (m)", ylabel="similarity", title="How alike two places are", xlim=(-1, 1))
+plt.show()
+
+# %% [markdown]
+# ## A world, a walk, a map
+# The tier `algebraic` has vectors alone; `rate` and `spiking` have the same parts in neurons.
+
+# %%
+world = paper_world()
+path = band_limited_path(60.0, 0.06, seed=5, time_step_s=0.01, reach_m=0.95)
+config = SSPSLAMConfig(
+    tier="algebraic",
+    time_step_s=0.01,
+    space={"n_rotations": 5, "n_scales": 5, "reach_m": 1.2},
+    places=True,
+)
+slam = slam_in(config, world)
+life = live(slam, [world], [path])
+print(f"error {1000 * life.ate_m[0]:.2f} mm; seen for", life.seen_s[0].round(1).tolist(), "s")
+
+# %% [markdown]
+# ## Questions
+
+# %%
+words = pointers_of(world, slam.space.n_features)
+asked = {
+    "BLUE * TRIANGLE": ["BLUE_TRIANGLE"],
+    "BLUE * (SQUARE + TRIANGLE)": ["BLUE_SQUARE", "BLUE_TRIANGLE"],
+    "WALL": ["WALL"],
+}
+answers = [
+    Query(said, similarity_map(slam, queries.recall(slam, words.parse(said))), names)
+    for said, names in asked.items()
+]
+plot_queries(world, path.position_m, answers, "What the map answers")
+
+# %%
+low, high = np.array([-0.45, -0.45]), np.array([0.9, 0.5])
+plot_area(world, low, high, queries.what(slam, low, high), "What is in the area?")
+
+# %% [markdown]
+# ## Noise, and what a map is good for
+# Phases that wander lose the position; oscillators that pull each other wander less, and landmarks that
+# are met again bring it back.
+
+# %%
+noisy = {"tier": "algebraic", "time_step_s": 0.01}
+alone = PathIntegratorConfig(phase_noise_rad=0.3, coupling="none")
+coupled = PathIntegratorConfig(phase_noise_rad=0.3)
+ten = random_world(10, seed=1)
+walk = band_limited_path(120.0, 0.08, seed=3, time_step_s=0.01)
+drift = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=alone), ten), [walk])
+kept = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [walk])
+closed = live(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [ten], [walk])
+at = np.array([landmark.position_m for landmark in ten.landmarks])
+plot_trials(
+    {
+        f"{name}|ATE {each.ate_m[0]:.3f} m": (
+            each.truth_m[:, 0],
+            at,
+            {"estimate": each.position_m[:, 0]},
+        )
+        for name, each in {"uncoupled": drift, "coupled": kept, "with a map": closed}.items()
+    },
+    "Phase noise 0.3 rad/√s",
+)
+
+# %% [markdown]
+# ## The same in spikes
+# Each oscillator is a population; a memory of neurons learns which place belongs to which pointer.
+
+# %%
+spiking = SSPSLAMConfig(
+    integrator=PathIntegratorConfig(neurons=200),
+    map=SemanticMapConfig(neurons=200),
+    binding="exact",
+)
+animal = slam_in(spiking, ten)
+fired = {"oscillators": [], "object-vector cells": [], "memory": []}
+
+
+def watch(_step, _said):
+    parts = (animal.integrator.neurons, animal.vectors.neurons, animal.map.memory)
+    for kept_spikes, part in zip(fired.values(), parts, strict=True):
+        kept_spikes.append(
+            part.spikes[:, 0].flatten()[:: max(1, part.n_neurons // 100)].numpy().copy()
+        )
+
+
+begin = int(np.argmax(ten.observe(walk.position_m).in_view.any(-1))) * 0.01
+short = walk.resampled(1e-3)
+first = max(0, round(begin * 1000) - 300)
+steps = slice(first, first + 2000)
+animal.start(torch.from_numpy(short.position_m[first : first + 1]))
+said = animal.run(
+    torch.from_numpy(short.velocity_m_s[steps, None]),
+    views([ten], short.position_m[steps, None]),
+    watch,
+)
+error = np.linalg.norm(said.position_m[:, 0].numpy() - short.position_m[steps], axis=-1)
+print(f"{animal.n_neurons} neurons, error {1000 * error.mean():.1f} mm over two seconds")
+plot_rasters(
+    {name: np.stack(spikes) for name, spikes in fired.items()},
+    1e-3,
+    0.0,
+    "A landmark comes into view",
+)
+
+# %% [markdown]
+# ## Two sessions, one map
+# Another animal begins elsewhere, with its own origin, and knows some of the same landmarks. The maps are
+# laid on each other by what both know.
+
+# %%
+shift = np.array([0.15, -0.1])
+first_map, second_map = (slam_in(SSPSLAMConfig(**noisy), ten) for _ in range(2))
+live(first_map, [ten], [walk.first(70.0)])
+later = walk._replace(position_m=walk.position_m[6000:])
+start = torch.from_numpy(later.position_m[:1] + shift).clamp(-1, 1)
+second_map.start(start)
+second_map.run(
+    torch.from_numpy(later.velocity_m_s[:, None]), views([ten], later.position_m[:, None])
+)
+merged, report = merge_semantic_maps(first_map, second_map)
+print(report.reason, "· moved by", [round(x, 3) for x in report.offset_m], "· added", report.added)
