@@ -30,8 +30,8 @@ from neuroslam.semantic_drawing import Query, plot_area, plot_queries
 from neuroslam.semantic_sections import PathIntegratorConfig, SemanticMapConfig, SSPSLAMConfig
 from neuroslam.sensors.landmark_paths import band_limited_path
 from neuroslam.sensors.landmarks import paper_world, random_world
-from neuroslam.spike_drawing import plot_rasters, plot_trials
-from neuroslam.spiking import PositionDecoder, SSPSpace, bind, queries
+from neuroslam.spike_drawing import plot_errors, plot_rasters, plot_signals, plot_trials
+from neuroslam.spiking import PositionDecoder, SSPSpace, bind, queries, unbind
 from neuroslam.spiking.joining import merge_semantic_maps
 
 torch.set_num_threads(1)
@@ -41,6 +41,8 @@ plt.rcParams.update(STYLE)
 # ## Positions as vectors
 # Binding two vectors adds their positions, so a map can be moved without being read. A vector is like
 # those of places nearby, with ripples: that is the width at which places are told apart.
+#
+# **What to see:** one peak, half as high 0.14 m away, and ripples below 0.2.
 
 # %%
 space = SSPSpace.hexagonal(n_rotations=5, n_scales=5)
@@ -76,6 +78,9 @@ print(f"error {1000 * life.ate_m[0]:.2f} mm; seen for", life.seen_s[0].round(1).
 
 # %% [markdown]
 # ## Questions
+# Sums of pointers recall sums of places; a wall is a region.
+#
+# **What to see:** the peaks lie in the rings, and the wall is warm along its whole length.
 
 # %%
 words = pointers_of(world, slam.space.n_features)
@@ -90,14 +95,36 @@ answers = [
 ]
 plot_queries(world, path.position_m, answers, "What the map answers")
 
+# %% [markdown]
+# A second memory goes the other way, from places to pointers; the box's own vector is its key.
+#
+# **What to see:** the square and the orange triangle are in the area, the blue triangle is not.
+
 # %%
 low, high = np.array([-0.45, -0.45]), np.array([0.9, 0.5])
 plot_area(world, low, high, queries.what(slam, low, high), "What is in the area?")
 
 # %% [markdown]
+# All of the map fits into one vector, the sum of each pointer bound to its place.
+#
+# **What to see:** unbound by a pointer, the same vector is where that landmark is, with some noise.
+
+# %%
+whole = queries.whole_map(slam)
+parts = []
+for landmark in world.landmarks:
+    place = unbind(whole, words.parse(landmark.pointer))
+    parts.append(
+        Query(landmark.pointer, similarity_map(slam, slam.space.to_fourier(place)), [landmark.name])
+    )
+plot_queries(world, None, parts, "The whole map in one vector, unbound")
+
+# %% [markdown]
 # ## Noise, and what a map is good for
 # Phases that wander lose the position; oscillators that pull each other wander less, and landmarks that
 # are met again bring it back.
+#
+# **What to see:** uncoupled, the estimate jumps about; coupled, it drifts; with a map, it drifts less.
 
 # %%
 noisy = {"tier": "algebraic", "time_step_s": 0.01}
@@ -122,8 +149,23 @@ plot_trials(
 )
 
 # %% [markdown]
+# **What to see:** errors grow until landmarks are met again.
+
+# %%
+panels = {
+    "distance error (m)": {
+        "uncoupled": drift.error_m,
+        "coupled": kept.error_m,
+        "with a map": closed.error_m,
+    }
+}
+plot_errors(drift.time_s, panels, "The same over time")
+
+# %% [markdown]
 # ## The same in spikes
 # Each oscillator is a population; a memory of neurons learns which place belongs to which pointer.
+#
+# **What to see:** the object-vector cells and the memory are silent until something comes into view.
 
 # %%
 spiking = SSPSLAMConfig(
@@ -160,6 +202,18 @@ plot_rasters(
     1e-3,
     0.0,
     "A landmark comes into view",
+)
+
+# %% [markdown]
+# **What to see:** what the memory recalls grows from nothing; the gate stays shut, as what is learnt in this
+# very visit knows no more than the animal does.
+
+# %%
+names = ("recall", "agreement", "gate")
+plot_signals(
+    1e-3 * np.arange(len(error)),
+    {name: getattr(said, name)[:, 0].numpy() for name in names},
+    "A landmark is learnt",
 )
 
 # %% [markdown]

@@ -303,7 +303,7 @@ def full(*_args, **_options):
 
 
 @pytest.mark.parametrize(
-    "where", ["neuroslam.brain.checkpoint.save_file", "os.fsync", "shutil.copyfile"]
+    "where", ["neuroslam.checked_files.save_file", "os.fsync", "shutil.copyfile"]
 )
 def test_on_a_full_disk_the_folder_stays_as_it_was(
     where, runs, merged, tmp_path, monkeypatch, mistake
