@@ -198,10 +198,10 @@ def test_who_is_put_elsewhere_finds_itself_at_a_known_landmark(tier):
     said = slam.run(torch.zeros(len(still.position_m), 1, 2), view)
     assert bool(said.lost.any())
     assert not bool(said.lost[-1])
-    # As near as a map of so few neurons has the landmark, and they have the position.
-    np.testing.assert_allclose(slam.integrator.position_m[0], true, atol=0.12)
-    where = recalled(slam)[0]
-    np.testing.assert_allclose(where[0], [0.4, 0.0], atol=0.06)
+    # It is where the map puts it; that is as near as a few neurons have the landmark.
+    off = recalled(slam)[0, 0] - [0.4, 0.0]
+    assert np.linalg.norm(off) < 0.1
+    np.testing.assert_allclose(slam.integrator.position_m[0], true + off, atol=0.03)
 
 
 def test_who_may_not_relocalise_stays_lost():
