@@ -5,9 +5,9 @@ import difflib
 import math
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from neuroslam.errors import ConfigError
 from neuroslam.sections import (
@@ -22,6 +22,9 @@ from neuroslam.sections import (
     ViewConfig,
     WallMemoryConfig,
 )
+from neuroslam.semantic_sections import SemanticConfig
+
+CellKind = Literal["pose", "place", "semantic"]
 
 
 class BrainConfig(Section):
@@ -41,14 +44,38 @@ class BrainConfig(Section):
     grid_cells: GridCellConfig = GridCellConfig()
     place_cells: PlaceCellConfig = PlaceCellConfig()
     wall_memory: WallMemoryConfig = WallMemoryConfig()
-    cells: Literal["pose", "place", "pose_and_place"] = Field(
-        "pose",
-        description="pose: views, pose cells and map (RatSLAM); place: boundary, grid and place "
-        "cells (SLRB); or both on the same frames",
+    semantic: SemanticConfig = SemanticConfig()
+    cells: tuple[CellKind, ...] = Field(
+        ("pose",),
+        description="any of pose: views, pose cells and map (RatSLAM); place: boundary, grid and "
+        "place cells (SLRB); semantic: landmarks and their places (SSP-SLAM); as pose+place",
     )
     frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
     threads: int = Field(1, ge=1, description="of a run; for one brain, one is the fastest")
     max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")
+
+    @field_validator("cells", mode="before")
+    @classmethod
+    def _told_as_text(cls, value: object) -> object:
+        if isinstance(value, str):  # pose_and_place: of files of earlier versions
+            value = value.replace("_and_", "+").split("+")
+        return value
+
+    @field_validator("cells")
+    @classmethod
+    def _in_order(cls, value: tuple[CellKind, ...]) -> tuple[CellKind, ...]:
+        if not value or len(set(value)) < len(value):
+            raise ValueError("expected one or several of pose, place, semantic, each once")
+        return tuple(kind for kind in get_args(CellKind) if kind in value)
+
+    def has(self, kind: CellKind) -> bool:
+        """Say whether such cells are among the brain's.
+
+        Example:
+            >>> BrainConfig(cells="pose+semantic").has("place")
+            False
+        """
+        return kind in self.cells
 
 
 # OpenRatSLAM's name -> (section, our name), for the parameters that carry over one to one.
@@ -251,19 +278,19 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         said = said[0].lower() + said[1:]
         if first["type"] == "model_type":
             said = f"is a section; set one of its keys, as {where}.KEY"
-        elif isinstance(first["loc"][-1], int):
+        elif where.endswith(("crop", "region")):
             said = "expected four whole numbers x_min, x_max, y_min, y_max"
         raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
 
 
-def _all_keys() -> list[str]:
+def _all_keys(section: type[BaseModel] = BrainConfig, path: str = "") -> list[str]:
     keys = []
-    for name, field in BrainConfig.model_fields.items():
-        section = field.annotation
-        if isinstance(section, type) and issubclass(section, BaseModel):
-            keys += [f"{name}.{key}" for key in section.model_fields]
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            keys += _all_keys(inner, f"{path}{name}.")
         else:
-            keys.append(name)
+            keys.append(f"{path}{name}")
     return keys
 
 
@@ -281,14 +308,16 @@ def to_toml(config: BrainConfig) -> str:
         >>> build_config(tomllib.loads(to_toml(BrainConfig()))) == BrainConfig()
         True
     """
-    lines, sections = [], []
-    for name, value in config.model_dump().items():
+    return "\n".join(_toml_table(config.model_dump(), "")) + "\n"
+
+
+def _toml_table(values: dict[str, Any], path: str) -> list[str]:
+    plain = {k: v for k, v in values.items() if not isinstance(v, dict) and v is not None}
+    lines = [f"{name} = {_toml(value)}" for name, value in plain.items()]
+    for name, value in values.items():
         if isinstance(value, dict):
-            body = [f"{k} = {_toml(v)}" for k, v in value.items() if v is not None]
-            sections.append("\n".join([f"\n[{name}]", *body]))
-        else:
-            lines.append(f"{name} = {_toml(value)}")
-    return "\n".join(lines + sections) + "\n"
+            lines += ["", f"[{path}{name}]", *_toml_table(value, f"{path}{name}.")]
+    return lines
 
 
 def _toml(value: object) -> str:

@@ -97,7 +97,7 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
 
 
 def _navigation_counts(brain: NavigationBrain) -> list[tuple[str, str]]:
-    if brain.config.cells == "pose":
+    if not brain.config.has("place"):
         return []
     cells = brain.navigation
     return [
@@ -226,7 +226,7 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         ("map.goals.experience", n, "experiences"),
         ("map.aliases.experience", n, "experiences"),
     ):
-        lowest = -1 if config.cells == "place" and name.endswith("template") else 0
+        lowest = -1 if not config.has("pose") and name.endswith("template") else 0
         rows = np.flatnonzero((s[name] < lowest) | (s[name] >= limit))
         if len(rows):
             yield f"{_row(name, rows)}: {name.split('.')[-1]} {_some(s[name][rows])}, " + (
@@ -240,8 +240,8 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
             yield f"{name}: is {s[name]}, expected {lowest} to {limit - 1}"
     yield from _link_faults(s, n)
     yield from _cell_faults(state, config)
-    if config.cells != "pose":
-        yield from _navigation_faults(s, n if config.cells == "place" else None)
+    if config.has("place"):
+        yield from _navigation_faults(s, n if not config.has("pose") else None)
     yield from _origin_faults(s, n)
 
 

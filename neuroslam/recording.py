@@ -103,7 +103,7 @@ class TensorBoardRecorder(Recorder):
         """Write what is due at this frame."""
         self._last = (result.frame, brain)
         self._seen += 1
-        if brain.config.cells != "pose":
+        if brain.config.has("place"):
             self._cells = self._cells or CellPanels()
             self._cells.note(brain)
         if result.frame % self.scalars_every == 0:
@@ -114,7 +114,7 @@ class TensorBoardRecorder(Recorder):
                 template = brain.view.template_image(result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
-            if brain.config.cells != "place":
+            if brain.config.has("pose"):
                 picture = activity_picture(brain.pose_cells.activity.numpy(force=True))
                 self._write_picture("cells/activity", picture, result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
@@ -143,7 +143,7 @@ class TensorBoardRecorder(Recorder):
         }
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
-        if brain.config.cells != "place":
+        if brain.config.has("pose"):
             values["cells/peak"] = brain.pose_cells.peak
         if self._cells is not None:
             values |= self._cells.scalars(brain)

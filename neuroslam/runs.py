@@ -357,7 +357,7 @@ def write_results(
         "links": brain.map.n_links,
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
-    if brain.config.cells != "pose":
+    if brain.config.has("place"):
         cells = brain.navigation
         summary.counts |= {
             "place_cells": int(cells.place.n_cells),

@@ -150,3 +150,60 @@ class SSPSLAMConfig(Section):
     quantised: bool = Field(
         False, description="weights of 8 bits, neurons of a chip, no function outside of them"
     )
+
+
+class RoomSpaceConfig(SSPSpaceConfig):
+    """The space of a robot among rooms: metres in place of arm's lengths."""
+
+    n_rotations: int = Field(5, ge=1, description="orientations of grid modules")
+    n_scales: int = Field(5, ge=1, description="spacings of grid modules, for each orientation")
+    length_scale_m: float | tuple[float, ...] = Field(
+        1.0, description="larger: broader bumps, in all directions or each; larger spaces need it"
+    )
+    reach_m: float | tuple[float, ...] = Field(
+        20.0, description="the robot stays in [-reach, reach] of where it starts"
+    )
+
+
+class RoomIntegratorConfig(PathIntegratorConfig):
+    """The path integrator of a robot."""
+
+    max_speed_m_s: float = Field(2.0, gt=0, description="faster is cut; larger: coarser rates")
+
+
+class SemanticConfig(SSPSLAMConfig):
+    """The semantic map of a brain: SSP-SLAM over rooms, and which landmarks it is told."""
+
+    tier: Literal["algebraic", "rate", "spiking"] = Field(
+        "algebraic", description="vectors alone; rates of neurons; spikes"
+    )
+    time_step_s: float = Field(0.05, gt=0, le=0.1, description="of the simulation; spikes: 0.001")
+    space: RoomSpaceConfig = RoomSpaceConfig()
+    integrator: RoomIntegratorConfig = RoomIntegratorConfig()
+    vector_reach_m: float = Field(6.0, gt=0, description="how far object-vector cells reach")
+    landmarks: tuple[Literal["given", "markers", "views"], ...] = Field(
+        ("given",),
+        min_length=1,
+        description="given: the source's; markers: ArUco or AprilTag in its pictures; views: each "
+        "known view is a landmark",
+    )
+    markers: str = Field(
+        "4X4_50", description="dictionary of markers, as OpenCV calls them after DICT_"
+    )
+    marker_size_m: float = Field(0.4, gt=0, description="side of a marker's black square")
+    key_features: int = Field(
+        256, ge=16, description="length of a landmark's pointer; more: more landmarks told apart"
+    )
+    same_m: float = Field(
+        1.0, gt=0, description="a landmark without a name is the known one within this distance"
+    )
+    sigma_m: float = Field(0.15, gt=0, description="error of a place that a landmark tells")
+    heading_rate_hz: float = Field(
+        0.2, ge=0, description="how fast bearings of landmarks correct an integrated heading"
+    )
+
+    @model_validator(mode="after")
+    def _is_a_plane(self) -> Self:
+        if self.space.dimension != 2:
+            raise ValueError(f"space.dimension is {self.space.dimension}; a brain lives in 2")
+        return self

@@ -47,7 +47,8 @@ class Frame(NamedTuple):
         walls: Distance (m) and bearing (rad, relative to the heading) of the foot of the
             perpendicular on each wall seen, ``(n, 2)``.
         heading_rad: Heading measured by a compass, in the world.
-        landmarks: Whatever landmark observations the source has, as an array.
+        landmarks: Landmarks in sight, ``(n, 3)``: number (-1 where it has no name), distance in
+            metres, bearing in radians relative to the heading.
         truth: True pose, where the source knows it. Never used by the brain, only by evaluation.
     """
 

@@ -83,7 +83,7 @@ class NavigationBrain(nn.Module):
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
         )
-        if config.cells != "pose":
+        if config.has("place"):
             self.navigation = NavigationCells(config)
         self.sessions = SessionLog()
         self.recognition = Recognition()
@@ -110,7 +110,7 @@ class NavigationBrain(nn.Module):
         try:
             dt_s = self._elapsed(frame)
             felt = self._felt(frame)
-            looks = frame.image is not None and self.config.cells != "place"
+            looks = frame.image is not None and self.config.has("pose")
             seen = self.view.look(frame.image) if looks else None
             velocity = self._velocity(frame, dt_s)
         except BadFrame as fault:
@@ -124,7 +124,7 @@ class NavigationBrain(nn.Module):
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         motion = Motion(*velocity, dt_s)
         where, turn_rad = None, 0.0
-        if self.config.cells != "pose":
+        if self.config.has("place"):
             turn_rad = self.navigation.heading_error_rad
             where = self.navigation.live(motion, frame.heading_rad, felt)
             turn_rad -= self.navigation.heading_error_rad
@@ -132,7 +132,7 @@ class NavigationBrain(nn.Module):
         view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
             self._name_session(frame, felt)
-        if self.config.cells == "place":
+        if not self.config.has("pose"):
             cells = PoseEstimate(*self.navigation.oscillators.position_m.tolist(), 0.0)
             place = NO_EXPERIENCE if where.lost else int(where.place)
             action, experience = self.map.visit(place, self.navigation.pose, dt_s, frame.index)
@@ -167,7 +167,7 @@ class NavigationBrain(nn.Module):
 
     def _felt(self, frame: Frame) -> np.ndarray | None:
         """Find the walls around, ``(n, 2)``, where the brain has cells for them; checked."""
-        if self.config.cells == "pose":
+        if not self.config.has("place"):
             return None
         if frame.heading_rad is not None and not math.isfinite(frame.heading_rad):
             raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
@@ -281,7 +281,7 @@ class NavigationBrain(nn.Module):
                     float(frame.time_s),
                     frame.image,
                     frame.velocity,
-                    *(() if self.config.cells == "pose" else (frame.heading_rad, felt)),
+                    *(() if not self.config.has("place") else (frame.heading_rad, felt)),
                 ),
                 *self.about,
                 frame.index,
@@ -367,7 +367,7 @@ class NavigationBrain(nn.Module):
                 "places_that_agree": agreed,
                 "reason": "maps without views are laid on each other when they are finished: "
                 "neuroslam merge"
-                if self.config.cells == "place"
+                if not self.config.has("pose")
                 else f"{alike} places looked like one of it, {agreed} at most agreed on how "
                 f"the maps lie; {needed} must",
             }

@@ -53,7 +53,7 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     shared = shared_history(loaded, partial)
     if shared is not None:
         return shared
-    if partial.config.cells == "place":
+    if not partial.config.has("pose"):
         return Found(*match_walls(loaded, partial))
     pairs, best = _alike(loaded, partial)
     threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm

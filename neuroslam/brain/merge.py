@@ -149,7 +149,7 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
     sections = ["view", "pose_cells"]
     if one.cells != other.cells:
         differing.append(f"cells is {one.cells} and {other.cells}")
-    elif one.cells != "pose":
+    elif one.has("place"):
         sections += ["boundary_cells", "grid_cells", "place_cells"]
     for section in sections:
         first, second = (getattr(config, section).model_dump() for config in (one, other))
@@ -231,7 +231,7 @@ def _move_cells(
     shift = loaded["map.experiences.cell"].numpy()[match.loaded] - pivot
     shift[2] += match.turn_rad * cells.n_theta / TWO_PI
     ways = view_ways = None
-    if config.sessions.cells == "none" or config.cells == "place":
+    if config.sessions.cells == "none" or not config.has("pose"):
         return np.zeros(3), bound, states
     if config.sessions.cells == "turn":
         angle = TWO_PI * pivot[2] / cells.n_theta - poses[match.partial, 2]
@@ -361,7 +361,7 @@ def merge(
     merged = type(partial)(partial.config)
     merged.take(state, [*map(deepcopy, loaded.stored), *map(deepcopy, partial.stored)])
     merged.to(partial.pose_cells.window.device)
-    if merged.config.cells == "place":
+    if not merged.config.has("pose"):
         merged.map.measure_links()  # a place cell that became another's lies where that does
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded, partial, merged, join)
@@ -415,7 +415,7 @@ def _describe(
     report.match = {
         **place(loaded, "loaded", match.loaded),
         **place(partial, "partial", match.partial),
-        "error": None if merged.config.cells == "place" else float(match.error),
+        "error": None if not merged.config.has("pose") else float(match.error),
         "runner_up": None if match.runner_up is None else float(match.runner_up),
         "relative_heading_rad": float(match.turn_rad),
         "places": len(match.pairs.partial),
@@ -437,7 +437,7 @@ def _describe(
             ("links", lambda brain: brain.map.n_links),
         )
     }
-    if merged.config.cells != "pose":
+    if merged.config.has("place"):
         report.counts |= {
             what: {"loaded": count(loaded), "partial": count(partial), "merged": count(merged)}
             for what, count in (

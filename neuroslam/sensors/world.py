@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.sensors.markers import in_sight, with_markers
 from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.render import Camera, measure_ranges, render
 from neuroslam.sensors.scene import Billboard, World
@@ -107,6 +108,28 @@ class WorldOptions(BaseModel):
     people: int = Field(0, ge=0, le=50, description="passers-by")
     ranges: int = Field(0, ge=0, le=3600, description="beams of a range scanner all around")
     range_noise_m: float = Field(0.01, ge=0, description="error of each beam")
+    markers: int = Field(0, ge=0, le=50, description="posts with ArUco markers 4X4_50 on the way")
+    landmark_reach: float = Field(
+        0.0, ge=0, description="deliver the posts in sight as landmarks up to here, m; 0: not"
+    )
+    landmark_noise: float = Field(
+        0.03, ge=0, description="their error: as a share of the distance, and in radians"
+    )
+    outliers: float = Field(
+        0.0, ge=0, le=1, description="share of landmarks that are said to be where they are not"
+    )
+    labels: bool = Field(True, description="landmarks have names; else they are to be told apart")
+    dark: str = Field(
+        "", pattern=r"^(\d+-\d+)?$", description="the camera is covered, seconds, as 60-120"
+    )
+    blind: str = Field(
+        "", pattern=r"^(\d+-\d+)?$", description="the scanner measures nothing, seconds, as 60-120"
+    )
+    carried: str = Field(
+        "",
+        pattern=r"^(\d+:0?\.\d+)?$",
+        description="the robot is carried, as 60:0.5: at 60 s on by half a lap",
+    )
 
     def odometry_noise(self) -> OdometryNoise:
         """Return the noise that ``noise`` and the single terms ask for together."""
@@ -178,8 +201,23 @@ class WorldSource(IndexedSource):
 
         first = round(options.start * self.frames_per_lap)
         lap = self.route.poses(self.frames_per_lap)
-        self._truths = lap[(first + np.arange(self.n_frames)) % self.frames_per_lap]
+        along = first + np.arange(self.n_frames)
+        self._truths = lap[along % self.frames_per_lap]
         moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
+        if options.carried:
+            at_s, share = options.carried.split(":")
+            at = max(1, round(float(at_s) * options.rate))
+            along[at:] += round(float(share) * self.frames_per_lap)
+            self._truths = lap[along % self.frames_per_lap]
+            drive = np.diff(self._truths, axis=0, prepend=self._truths[:1])
+            drive[at : at + 1] = moved[at : at + 1]  # wheels do not feel that one is carried
+            moved = drive
+        self.places_m = np.empty((0, 2))
+        if options.markers:
+            self.world, self.places_m = with_markers(
+                world, options.markers, world.sense.camera_height_m
+            )
+        self._dark, self._blind = _span(options.dark), _span(options.blind)
         true = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), wrap_angles(moved[:, 2])])
         self._velocities = self.noise.apply(true * options.rate, options.seed)
         rng = np.random.default_rng([options.seed, 2])
@@ -230,15 +268,57 @@ class WorldSource(IndexedSource):
         image = render(self.world, pose, self.camera, self.figures(time_s), self.gain(time_s))
         if self.options.grey:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if _within(time_s, self._dark):
+            image = np.zeros_like(image)
         velocity = Velocity(*self._velocities[index].tolist()) if self._has_odometry else None
         ranges = self._measure(index, pose) if self.options.ranges else None
-        return Frame(index, time_s, image=image, velocity=velocity, ranges=ranges, truth=pose)
+        if ranges is not None and _within(time_s, self._blind):
+            ranges = None
+        return Frame(
+            index,
+            time_s,
+            image=image,
+            velocity=velocity,
+            ranges=ranges,
+            landmarks=self._landmarks(index, pose) if self.options.landmark_reach else None,
+            truth=pose,
+        )
+
+    def _landmarks(self, index: int, pose: Pose) -> np.ndarray:
+        """Number, distance and bearing of the posts in sight, ``(n, 3)``."""
+        options, camera = self.options, self.camera
+        seen = in_sight(self.world, pose, self.places_m, camera.camera_height_m)
+        distance, bearing = seen.T
+        wide = math.pi if camera.panoramic else math.radians(camera.fov_deg) / 2.0
+        there = (distance <= options.landmark_reach) & (np.abs(bearing) < wide)
+        # Drawn for all: what one landmark adds does not depend on which others are in sight.
+        draw = np.random.default_rng([options.seed, 4, index])
+        noise = options.landmark_noise * draw.standard_normal((2, len(seen)))
+        wrong = draw.uniform(size=len(seen)) < options.outliers
+        elsewhere = draw.uniform(
+            [[0.3], [-wide]], [[options.landmark_reach], [wide]], (2, len(seen))
+        )
+        distance = np.where(wrong, elsewhere[0], distance * (1.0 + noise[0]))
+        bearing = np.where(wrong, elsewhere[1], bearing + noise[1])
+        number = np.arange(len(seen)) if options.labels else np.full(len(seen), -1)
+        return np.column_stack([number, np.maximum(distance, 0.0), bearing])[there]
 
     def _measure(self, index: int, pose: Pose) -> np.ndarray:
         options = self.options
         ranges = measure_ranges(self.world, pose, options.ranges, self.camera.camera_height_m)
         noise = np.random.default_rng([options.seed, 3, index]).standard_normal(len(ranges))
         return np.maximum(ranges + options.range_noise_m * noise, 0.0)
+
+
+def _span(text: str) -> tuple[float, float] | None:
+    if not text:
+        return None
+    begin, end = map(float, text.split("-"))
+    return begin, end
+
+
+def _within(time_s: float, span: tuple[float, float] | None) -> bool:
+    return span is not None and span[0] <= time_s < span[1]
 
 
 def open_world(spec: str) -> WorldSource:

@@ -124,13 +124,14 @@ def recall(slam: SSPSLAM, key: Tensor, animal: int = 0) -> Tensor:
 
     Args:
         slam: With its map.
-        key: Of a landmark, or of several together, ``(n_features,)``; its length does not matter
+        key: Of a landmark, or of several together, ``(n_key,)``; its length does not matter
             where it is of one. Sums of pointers recall sums of places.
         animal: Of a batch.
     """
-    if key.shape != (slam.space.n_features,):
+    n_key = slam.pointers.shape[1]
+    if key.shape != (n_key,):
         raise SpaceError(
-            f"recall: a pointer of shape {tuple(key.shape)}, the map has {slam.space.n_features} "
+            f"recall: a pointer of shape {tuple(key.shape)}, the map has {n_key} "
             "features; make it with the map's vocabulary"
         )
     return slam.space.to_fourier(slam.map.read(key.unsqueeze(0))[animal, 0])

@@ -74,7 +74,8 @@ class SSPSLAM(Running):
 
     Args:
         config: All of it.
-        pointers: Of the landmarks that it can tell apart, ``(landmarks, n_features)``.
+        pointers: Of the landmarks that it can tell apart, ``(landmarks, n_key)``; as many features
+            as the space has let them be bound with places, others are keys only.
         names: Of the landmarks; ``None``: their numbers.
         batch: Animals side by side.
 
@@ -107,11 +108,12 @@ class SSPSLAM(Running):
         self.names = tuple(names or (str(k) for k in range(len(pointers))))
         space = SSPSpace.from_config(config.space)
         c, dt, seed, n = config, config.time_step_s, config.seed, space.n_features
-        if pointers.ndim != 2 or pointers.shape[1] != n:
+        if pointers.ndim != 2:
             raise SpaceError(
-                f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n}); "
-                "make them with SemanticPointers of as many features"
+                f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, "
+                "features); make them with SemanticPointers"
             )
+        n_key = pointers.shape[1]
         if len(self.names) != len(pointers) or len(set(self.names)) < len(self.names):
             raise SpaceError(
                 f"SSPSLAM: {len(self.names)} names for {len(pointers)} pointers; "
@@ -123,13 +125,13 @@ class SSPSLAM(Running):
         self.register_buffer("pointers", pointers.detach().float().clone())
         if c.tier == "algebraic":
             self.integrator = AlgebraicIntegrator(space, c.integrator, dt, seed, batch)
-            self.map = AlgebraicMap(n, n, c.map, dt, batch)
-            self.places = AlgebraicMap(n, n, c.map, dt, batch) if c.places else None
+            self.map = AlgebraicMap(n_key, n, c.map, dt, batch)
+            self.places = AlgebraicMap(n, n_key, c.map, dt, batch) if c.places else None
             self.vectors = self.grid = self.binding = self.unbinding = None
         else:
             self.integrator = PathIntegrator(space, c.integrator, neurons, dt, seed, batch)
             keys = self.pointers if c.map.voja_rate == 0 else None
-            self.map = AssociativeMap(n, n, c.map, neurons, dt, seed + 1, batch, keys)
+            self.map = AssociativeMap(n_key, n, c.map, neurons, dt, seed + 1, batch, keys)
             self.places = self._place_memory(neurons, seed + 6) if c.places else None
             self.vectors = self.grid = None
             if c.vector_neurons:
@@ -293,7 +295,8 @@ class SSPSLAM(Running):
         # An area is like each of its places a little: cells must answer to that.
         low = {"voja_rate": 0.0, "intercept": min(c.map.intercept, _AREA_INTERCEPT)}
         config = c.map.model_copy(update=low)
-        return AssociativeMap(n, n, config, neurons, c.time_step_s, seed, self.batch, keys)
+        n_key = self.pointers.shape[1]
+        return AssociativeMap(n, n_key, config, neurons, c.time_step_s, seed, self.batch, keys)
 
     def _late(self, name: str, z: Tensor, tau_s: float) -> Tensor:
         """Delay by as much as the other's synapse does, or who moves would be pulled back."""
