@@ -36,6 +36,8 @@ class Join(NamedTuple):
         experience_cells: The same of the partial experiences, ``(n_experiences, 3)``.
         pivot: Pose of the matched experience in the partial map.
         onto: Pose that it takes in the merged map.
+        cells: The same two poses in the frames of cells that keep positions themselves, where
+            those are not the maps'.
     """
 
     views: np.ndarray
@@ -50,6 +52,7 @@ class Join(NamedTuple):
     experience_cells: np.ndarray
     pivot: Pose
     onto: Pose
+    cells: tuple[Pose, Pose] | None = None
 
     @property
     def rotation_rad(self) -> float:
@@ -85,12 +88,26 @@ class Join(NamedTuple):
             >>> join.place(np.array([[2.0, 0.0, 0.0]])).round(9).tolist()
             [[5.0, 6.0, 1.570796327]]
         """
-        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        dx, dy = poses[:, 0] - self.pivot.x_m, poses[:, 1] - self.pivot.y_m
         turned = wrap_angles(poses[:, 2] - self.pivot.theta_rad + self.onto.theta_rad)
-        return np.column_stack(
-            [c * dx - s * dy + self.onto.x_m, s * dx + c * dy + self.onto.y_m, turned]
-        )
+        return np.column_stack([_moved(poses[:, :2], self.pivot, self.onto), turned])
+
+    @property
+    def cells_turn_rad(self) -> float:
+        """By how much positions turn that partial cells keep."""
+        pivot, onto = self.cells or (self.pivot, self.onto)
+        return wrap_angle(onto.theta_rad - pivot.theta_rad)
+
+    def place_cells(self, points_m: np.ndarray) -> np.ndarray:
+        """Move positions that partial cells keep, ``(n, 2)``, into the loaded cells' frame."""
+        return _moved(points_m, *(self.cells or (self.pivot, self.onto)))
+
+
+def _moved(points_m: np.ndarray, pivot: Pose, onto: Pose) -> np.ndarray:
+    """Turn points about a pose and move them, so that it comes to lie onto another."""
+    turn = onto.theta_rad - pivot.theta_rad
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = points_m[:, 0] - pivot.x_m, points_m[:, 1] - pivot.y_m
+    return np.column_stack([c * dx - s * dy + onto.x_m, s * dx + c * dy + onto.y_m])
 
 
 class Population(nn.Module, ABC):

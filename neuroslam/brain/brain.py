@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,16 +16,18 @@ from neuroslam.brain.merge import Match, differing_keys, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.boundary import check_walls
-from neuroslam.cells.navigation import NavigationCells, Whereabouts
+from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.geometry import TWO_PI, compose
+from neuroslam.geometry import TWO_PI, compose, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.population import Population, Running, State
+from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
+from neuroslam.spiking.semantic import Guide, SemanticCells, Sightings, Told
 from neuroslam.storage import Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
@@ -38,6 +42,7 @@ from neuroslam.types import (
 )
 from neuroslam.view.templates import LocalViewCells
 
+_COMPASS_S = 2.0  # over which the noise of a compass is averaged
 BLIND = ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
 
 
@@ -45,12 +50,27 @@ class Clock(Scalars, Running):
     """Frame and time the brain is at."""
 
 
+class Compass(Scalars, Running):
+    """Heading of the robot by compass and turns together, as the map has taken it over."""
+
+
+class Sensed(NamedTuple):
+    """What a brain finds in a frame: the view, encoded; walls, ``(n, 2)``; landmarks."""
+
+    view: np.ndarray | None
+    walls: np.ndarray | None
+    landmarks: Sightings
+
+
 class NavigationBrain(nn.Module):
-    """RatSLAM: a stream of frames becomes a map of places.
+    """A stream of frames becomes a map of places, by any set of populations side by side.
 
     Each stage is a module that can be used alone: ``odometry``, ``view``, ``pose_cells`` and
-    ``map``. ``state_dict`` holds everything: a brain that is saved, loaded and goes on is
-    bit-equal to one that never stopped.
+    ``map`` (RatSLAM); ``navigation``, boundary, grid and place cells (SLRB), and ``semantic``,
+    landmarks and their places (SSP-SLAM), where ``config.cells`` names them. Where there are
+    several, they have one belief of where the robot is: self-motion and walls move it, landmarks
+    and views correct it, and each is told of what the others found. ``state_dict`` holds
+    everything: a brain that is saved, loaded and goes on is bit-equal to one that never stopped.
 
     Args:
         config: Every parameter; the defaults suit a forward camera on a small robot.
@@ -85,6 +105,11 @@ class NavigationBrain(nn.Module):
         )
         if config.has("place"):
             self.navigation = NavigationCells(config)
+        if config.has("semantic"):
+            heading = math.radians(config.map.initial_heading_deg)
+            follows = "map" if config.has("pose") else "cells" if config.has("place") else "nothing"
+            self.semantic = SemanticCells(config.semantic, heading, follows)
+        self.compass = Compass(heading_rad=0.0, known=0)
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
@@ -109,12 +134,11 @@ class NavigationBrain(nn.Module):
         """
         try:
             dt_s = self._elapsed(frame)
-            felt = self._felt(frame)
-            looks = frame.image is not None and self.config.has("pose")
-            seen = self.view.look(frame.image) if looks else None
+            sensed = self._sense(frame)
             velocity = self._velocity(frame, dt_s)
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
+        seen = sensed.view
         gap = dt_s > self.config.max_gap_s
         carried = seen is not None and self.continuity.breaks(seen) and self._detects
         if gap or carried:
@@ -123,26 +147,35 @@ class NavigationBrain(nn.Module):
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         motion = Motion(*velocity, dt_s)
-        where, turn_rad = None, 0.0
-        if self.config.has("place"):
-            turn_rad = self.navigation.heading_error_rad
-            where = self.navigation.live(motion, frame.heading_rad, felt)
-            turn_rad -= self.navigation.heading_error_rad
         self.continuity.moved(velocity, dt_s)
         view = BLIND if seen is None else self.view.recognise(seen)
         if not self.sessions.sessions:
-            self._name_session(frame, felt)
-        if not self.config.has("pose"):
-            cells = PoseEstimate(*self.navigation.oscillators.position_m.tolist(), 0.0)
-            place = NO_EXPERIENCE if where.lost else int(where.place)
-            action, experience = self.map.visit(place, self.navigation.pose, dt_s, frame.index)
-        else:
+            self._name_session(frame, sensed)
+        place, lost, turn = NO_EXPERIENCE, False, 0.0
+        if self.config.has("place"):
+            turn = self.navigation.heading_error_rad
+            where = self.navigation.live(motion, frame.heading_rad, sensed.walls)
+            turn -= self.navigation.heading_error_rad
+            place, lost = NO_EXPERIENCE if where.lost else int(where.place), bool(where.lost)
+        if self.config.has("pose"):
+            turn += self._turn_by_compass(frame.heading_rad, motion)
             cells = self.pose_cells(motion, view)
-            carried = where is not None and self.navigation.contradicts(view)
-            action, experience = self.map(motion, view, cells, frame.index, carried=carried)
-            if where is not None:
-                self._correct(where, turn_rad)
+            elsewhere = self.config.has("place") and self.navigation.contradicts(view)
+            action, experience = self.map(motion, view, cells, frame.index, carried=elsewhere)
+            if self.config.has("place"):
+                self._correct(*where.correction_m.tolist(), turn, self.navigation.pose.theta_rad)
                 self.navigation.see(view)
+            else:
+                self._correct(0.0, 0.0, turn, 0.0)
+        if self.config.has("semantic"):
+            told = self._meet_landmarks(frame, motion, sensed.landmarks, view)
+            lost = lost or told.lost
+            if not self.config.has("place"):
+                place = told.landmark
+        if not self.config.has("pose"):
+            pose = self.navigation.pose if self.config.has("place") else self.semantic.pose
+            cells = PoseEstimate(pose.x_m, pose.y_m, 0.0)
+            action, experience = self.map.visit(place, pose, dt_s, frame.index)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
         self.clock.after_gap_s = -math.inf
@@ -162,32 +195,98 @@ class NavigationBrain(nn.Module):
             n_templates=self.view.n,
             n_experiences=self.map.n,
             n_links=self.map.n_links,
-            lost=where is not None and bool(where.lost),
+            lost=lost,
         )
 
-    def _felt(self, frame: Frame) -> np.ndarray | None:
-        """Find the walls around, ``(n, 2)``, where the brain has cells for them; checked."""
-        if not self.config.has("place"):
-            return None
+    def _sense(self, frame: Frame) -> Sensed:
+        """Find in a frame what the brain has cells for; checked, and nothing changed by it."""
+        config, image = self.config, frame.image
+        walls = view = None
+        landmarks = []
         if frame.heading_rad is not None and not math.isfinite(frame.heading_rad):
             raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
-        if frame.walls is not None:
+        if config.has("place") and frame.walls is not None:
             check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
-            return frame.walls
-        if frame.ranges is None:
-            return None
-        return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
+            walls = frame.walls
+        elif config.has("place") and frame.ranges is not None:
+            walls = walls_in_scan(frame.ranges, config.boundary_cells.reach_m)
+        if config.has("semantic"):
+            if "given" in config.semantic.landmarks and frame.landmarks is not None:
+                landmarks.append(frame.landmarks)
+            if "markers" in config.semantic.landmarks and image is not None:
+                landmarks.append(self._markers(image))
+        if config.has("pose") and image is not None:
+            view = self.view.look(image)
+        rows = np.concatenate(landmarks) if landmarks else np.empty((0, 3))
+        return Sensed(view, walls, Sightings.of(rows))
 
-    def _correct(self, where: Whereabouts, turn_rad: float) -> None:
-        """Let pose cells and map follow what walls have corrected."""
-        x, y = where.correction_m.tolist()
-        if x == y == turn_rad == 0.0:
+    @cached_property
+    def _markers(self) -> MarkerDetector:
+        c = self.config
+        return MarkerDetector(
+            c.semantic.markers, c.semantic.marker_size_m, c.odometry.fov_deg, c.view.panoramic
+        )
+
+    def _turn_by_compass(self, heading_rad: float | None, motion: Motion) -> float:
+        """By how much the map turns, so that its heading follows a compass within seconds.
+
+        Pose cells and map alone do without, as RatSLAM does.
+        """
+        now, cells = self.compass, self.config.cells
+        if cells == ("pose",) or (heading_rad is None and not now.known):
+            return 0.0
+        now.heading_rad += motion.w_rad_s * motion.dt_s
+        if heading_rad is None:
+            return 0.0
+        if not now.known:
+            now.heading_rad, now.known = heading_rad, 1
+        off = wrap_angle(heading_rad - now.heading_rad)
+        turn = off * (1.0 - math.exp(-motion.dt_s / _COMPASS_S))
+        now.heading_rad += turn
+        return turn
+
+    def _meet_landmarks(
+        self, frame: Frame, motion: Motion, landmarks: Sightings, view: ViewMatch
+    ) -> Told:
+        """Learn the landmarks in sight; let map and other cells follow what known ones correct."""
+        if "views" in self.config.semantic.landmarks and view.template != NO_TEMPLATE:
+            landmarks = landmarks.with_view(view.template)
+        guide = None
+        if self.config.has("pose"):
+            poses = self.map.experiences["pose"].numpy(force=True)
+            self.semantic.follow_map(poses)
+            guide = Guide(self.map.pose, 0.0, self.map.current, poses)
+        elif self.config.has("place"):
+            guide = Guide(self.navigation.pose, self.navigation.variance_m2)
+        told = self.semantic.live(
+            motion, landmarks, compass_rad=frame.heading_rad, guide=guide, frame=frame.index
+        )
+        if self.config.has("pose"):
+            (x, y), facing = told.correction_m, self.map.pose.theta_rad
+            self._correct(x, y, told.turn_rad, facing)
+            if told.lost and self.config.has("place"):
+                here = self.navigation.pose
+                x, y = _rotated(x, y, here.theta_rad - facing)
+                moved = Pose(here.x_m + x, here.y_m + y, here.theta_rad)
+                self.navigation.go_to(moved, self.config.semantic.sigma_m)
+        elif self.config.has("place") and told.place_m is not None:
+            sigma = self.config.semantic.sigma_m
+            if told.lost:  # it was carried there
+                heading = self.navigation.pose.theta_rad
+                self.navigation.go_to(Pose(*told.place_m, heading), sigma)
+            else:
+                self.navigation.hear(told.place_m, sigma, told.variance_m2)
+        return told
+
+    def _correct(self, x_m: float, y_m: float, turn_rad: float, heading_rad: float) -> None:
+        """Let pose cells and map follow a correction, in the frame of one who has that heading."""
+        if x_m == y_m == turn_rad == 0.0:
             return
-        heading, cells = self.navigation.pose.theta_rad, self.config.pose_cells
+        cells = self.config.pose_cells
         facing = TWO_PI * self.pose_cells.estimate.theta / cells.n_theta
-        self.map.nudge(*_rotated(x, y, self.map.pose.theta_rad - heading), turn_rad)
+        self.map.nudge(*_rotated(x_m, y_m, self.map.pose.theta_rad - heading_rad), turn_rad)
         self.pose_cells.nudge(
-            *(way / cells.cell_size_m for way in _rotated(x, y, facing - heading)),
+            *(way / cells.cell_size_m for way in _rotated(x_m, y_m, facing - heading_rad)),
             turn_rad * cells.n_theta / TWO_PI,
         )
 
@@ -269,7 +368,7 @@ class NavigationBrain(nn.Module):
         while tally.n < len(stored):
             tally.append(alike=0, agreed=0)
 
-    def _name_session(self, frame: Frame, felt: np.ndarray | None = None) -> None:
+    def _name_session(self, frame: Frame, sensed: Sensed) -> None:
         """Open a session, or give the one that was announced its id, by what it begins with."""
         self._open(
             Session(
@@ -281,7 +380,8 @@ class NavigationBrain(nn.Module):
                     float(frame.time_s),
                     frame.image,
                     frame.velocity,
-                    *(() if not self.config.has("place") else (frame.heading_rad, felt)),
+                    *((frame.heading_rad, sensed.walls) if self.config.has("place") else ()),
+                    *(sensed.landmarks if self.config.has("semantic") else ()),
                 ),
                 *self.about,
                 frame.index,

@@ -10,12 +10,14 @@ import torch
 
 from neuroslam.brain.limits import far_off, tolerance
 from neuroslam.cells.attractor import moved_cells
+from neuroslam.cells.joining import view_frames
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.joining import links_kept
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.population import Join, Population, State
+from neuroslam.spiking.semantic import shared_frames
 from neuroslam.types import NO_TEMPLATE, Pose
 
 if TYPE_CHECKING:
@@ -145,12 +147,14 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
         >>> differing_keys(BrainConfig(), BrainConfig(view={"threshold": 0.04}))
         ['view.threshold is 0.05 and 0.04']
     """
-    differing = []
     sections = ["view", "pose_cells"]
     if one.cells != other.cells:
-        differing.append(f"cells is {one.cells} and {other.cells}")
-    elif one.has("place"):
+        return [f"cells is {'+'.join(one.cells)} and {'+'.join(other.cells)}"]
+    if one.has("place"):
         sections += ["boundary_cells", "grid_cells", "place_cells"]
+    if one.has("semantic"):
+        sections += ["semantic"]
+    differing = []
     for section in sections:
         first, second = (getattr(config, section).model_dump() for config in (one, other))
         differing += [
@@ -199,7 +203,7 @@ def make_join(loaded: State, partial: State, match: Match, config: BrainConfig) 
     has_view = views["partial"] != NO_TEMPLATE  # a place without a camera has none
     turns[has_view] = view_turns[views["partial"][has_view]]
     turns[pairs.partial] = pairs.turn_rad
-    return Join(
+    join = Join(
         views=_numbered(len(view_ids), n_views, np.flatnonzero(view_ids >= 0),
                         view_ids[view_ids >= 0]),
         experiences=experiences,
@@ -214,6 +218,24 @@ def make_join(loaded: State, partial: State, match: Match, config: BrainConfig) 
         pivot=pivot,
         onto=match.onto or Pose(x, y, wrap_angle(theta + match.turn_rad)),
     )  # fmt: skip
+    return join._replace(cells=_cell_frames(loaded, partial, join, config))
+
+
+def _cell_frames(
+    loaded: State, partial: State, join: Join, config: BrainConfig
+) -> tuple[Pose, Pose] | None:
+    """Say how the frames of cells lie that keep positions; ``None``: as the maps do."""
+    if config.has("place"):
+        return view_frames(*(_part_of(s, "navigation") for s in (loaded, partial)), join)
+    if config.has("semantic") and not config.has("pose"):
+        same_m = config.semantic.same_m
+        return shared_frames(*(_part_of(s, "semantic") for s in (loaded, partial)), same_m=same_m)
+    return None
+
+
+def _part_of(state: State, name: str) -> State:
+    return {key.removeprefix(f"{name}."): value for key, value in state.items()
+            if key.startswith(f"{name}.")}  # fmt: skip
 
 
 def _move_cells(
@@ -301,11 +323,7 @@ def merge_states(
     join = make_join(loaded, partial, match, config)
     merged: State = {}
     for name, population in populations.items():
-        states = [
-            {key.removeprefix(f"{name}."): value for key, value in state.items()
-             if key.startswith(f"{name}.")}
-            for state in (loaded, partial)
-        ]  # fmt: skip
+        states = [_part_of(state, name) for state in (loaded, partial)]
         with torch.no_grad():
             result = population.merged(*states, join)
         if set(result) != set(states[1]):
@@ -444,6 +462,12 @@ def _describe(
                 ("place cells", lambda brain: int(brain.navigation.place.n_cells)),
                 ("walls", lambda brain: int(brain.navigation.walls.n_walls)),
             )
+        }
+    if merged.config.has("semantic"):
+        report.counts["landmarks"] = {
+            "loaded": loaded.semantic.n,
+            "partial": partial.semantic.n,
+            "merged": merged.semantic.n,
         }
 
 

@@ -59,7 +59,7 @@ def join_navigation(loaded: State, partial: State, join: Join) -> State:
         partial: State of the session that goes on.
         join: How ids of views and experiences change.
     """
-    frames = _frames(loaded, partial, join)
+    frames = Frames(*(join.cells or (join.pivot, join.onto)))
     mapped = len(join.experiences) == int(partial["place.n_cells"][0]) and not len(join.views)
     ids = join.experiences if mapped else _same_places(loaded, partial, frames)
     merged = {name: value for name, value in partial.items() if name not in loaded}
@@ -79,18 +79,23 @@ def join_navigation(loaded: State, partial: State, join: Join) -> State:
     return merged
 
 
-def _frames(loaded: State, partial: State, join: Join) -> Frames:
-    """Lay the partial frame on the loaded one by the views that both know; else by the maps."""
+def view_frames(loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
+    """Say how the frames of two sessions lie by the views that both know.
+
+    Returns:
+        A pose in the partial frame, and the same in the loaded one; ``None`` if no such view was
+        learnt by who knew its place.
+    """
     same = np.flatnonzero(join.views < join.n_views)
     rows = [_seen(partial)[same], _seen(loaded)[join.views[same]]]
     sure = (rows[0][:, 3] > 0) & (rows[1][:, 3] > 0)
     if not sure.any():
-        return Frames(join.pivot, join.onto)
+        return None
     one, other = rows[0][sure], rows[1][sure]
     turns = other[:, 2] - one[:, 2] + join.view_turns_rad[same][sure]
     turn = math.atan2(np.sin(turns).mean(), np.cos(turns).mean())
     middle, onto = one[:, :2].mean(0), other[:, :2].mean(0)
-    return Frames(Pose(*middle, 0.0), Pose(*onto, turn))
+    return Pose(*middle.tolist(), 0.0), Pose(*onto.tolist(), turn)
 
 
 def _seen(state: State) -> np.ndarray:

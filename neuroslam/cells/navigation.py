@@ -266,6 +266,42 @@ class NavigationCells(Population):
         self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
         return True
 
+    @property
+    def variance_m2(self) -> float:
+        """How sure one animal is of its position: the mean variance of x and y."""
+        return 0.5 * self.walls.expected_variance_m2[0].trace().item()
+
+    @without_gradients
+    def hear(self, place_m: tuple[float, float], sigma_m: float, variance_m2: float) -> bool:
+        r"""Be corrected by where a known landmark puts one animal.
+
+        A landmark makes no one surer than who learnt it was: its error is taken to be the
+        :math:`R` with which the variance :math:`P` of the position becomes just that,
+
+        .. math:: R = \frac{P (P_0 + \sigma^2)}{P - (P_0 + \sigma^2)}
+
+        so that looking again at what was learnt a moment ago tells nothing.
+
+        Args:
+            place_m: Where that is.
+            sigma_m: Error of it.
+            variance_m2: Of the position when the landmark was learnt, :math:`P_0`.
+
+        Returns:
+            Whether it was near enough to be believed.
+        """
+        here, then = self.oscillators.position_m, variance_m2 + sigma_m**2
+        variance = self.variance_m2
+        if variance <= then:
+            return True
+        error = variance * then / (variance - then)
+        off = math.hypot(place_m[0] - here[0].item(), place_m[1] - here[1].item())
+        if off > self.config.wall_memory.gate * math.sqrt(2.0 * variance + sigma_m**2):
+            return False
+        target = here.new_tensor(place_m)
+        self.oscillators.shift(self.walls.observe_position(here, target, math.sqrt(error)))
+        return True
+
     @without_gradients
     def go_to(self, pose: Pose, sigma_m: float) -> None:
         """Set pose and phases of one animal anew; what it remembers stays.

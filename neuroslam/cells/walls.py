@@ -94,6 +94,15 @@ class WallMemory(Running):
         return self.covariance[:, :2, :2].clone()
 
     @property
+    def expected_variance_m2(self) -> Tensor:
+        """The same, with what the motion since then has added."""
+        p, (lever, spread) = self.covariance, self._spreading()
+        across = lever @ p[:, 2:4, :2]
+        own = lever @ p[:, 2:4, 2:4] @ lever.mT
+        added = torch.diag_embed(spread.unsqueeze(-1).expand(-1, 2))
+        return p[:, :2, :2] + across + across.mT + own + added
+
+    @property
     def is_due(self) -> bool:
         """Whether enough time went by since the last look for a new one to tell something."""
         return self.since.s >= self.config.period_s - 1e-9
@@ -260,14 +269,9 @@ class WallMemory(Running):
         """
         c, p = self.config, self.covariance  # edited in place: it is the largest part by far
         dt_s = self.since.s
-        d = self.moved_m
-        lever = torch.stack(
-            [d / (self.errors[:, :1] - 1.0), d.flip(-1) * d.new_tensor([1.0, -1.0])], dim=-1
-        )
+        lever, spread = self._spreading()
         p[:, :2, :] += lever @ p[:, 2:4, :]
         p[:, :, :2] += p[:, :, 2:4] @ lever.mT
-        share = 0.5 * (c.speed_factor**2 + math.radians(c.heading_white_deg) ** 2)
-        spread = share * self.squares_m2 + 0.5 * c.speed_add_m_s**2 * SAMPLE_S * dt_s
         p[:, 0, 0] += spread
         p[:, 1, 1] += spread
         stays = math.exp(-dt_s / c.heading_slow_s)
@@ -277,6 +281,16 @@ class WallMemory(Running):
             self.errors = self.errors * self.errors.new_tensor([1.0, stays])
         p[:, 3, 3] += math.radians(c.heading_slow_deg) ** 2 * (1.0 - stays * stays)
         self.start_anew()
+
+    def _spreading(self) -> tuple[Tensor, Tensor]:
+        """How errors of speed and compass move the position, and what each sample's own add."""
+        c, d = self.config, self.moved_m
+        lever = torch.stack(
+            [d / (self.errors[:, :1] - 1.0), d.flip(-1) * d.new_tensor([1.0, -1.0])], dim=-1
+        )
+        share = 0.5 * (c.speed_factor**2 + math.radians(c.heading_white_deg) ** 2)
+        added = 0.5 * c.speed_add_m_s**2 * SAMPLE_S * self.since.s
+        return lever, share * self.squares_m2 + added
 
     def _meet(
         self,

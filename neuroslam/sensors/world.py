@@ -12,6 +12,7 @@ from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.sensors.markers import in_sight, with_markers
 from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.render import Camera, measure_ranges, render
+from neuroslam.sensors.rodent import ornstein_uhlenbeck
 from neuroslam.sensors.scene import Billboard, World
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.worlds import build_world, catalogue
@@ -30,6 +31,7 @@ __all__ = [
 
 _PERSON_M = (0.8, 1.8)
 _STEP_M = 0.35
+_COMPASS_S = 30.0  # within which the slow half of a compass's error changes
 
 
 class OdometryNoise(NamedTuple):
@@ -108,6 +110,9 @@ class WorldOptions(BaseModel):
     people: int = Field(0, ge=0, le=50, description="passers-by")
     ranges: int = Field(0, ge=0, le=3600, description="beams of a range scanner all around")
     range_noise_m: float = Field(0.01, ge=0, description="error of each beam")
+    compass_deg: float | None = Field(
+        None, ge=0, le=90, description="deliver a compass; its error, half white, half slow"
+    )
     markers: int = Field(0, ge=0, le=50, description="posts with ArUco markers 4X4_50 on the way")
     landmark_reach: float = Field(
         0.0, ge=0, description="deliver the posts in sight as landmarks up to here, m; 0: not"
@@ -217,6 +222,13 @@ class WorldSource(IndexedSource):
             self.world, self.places_m = with_markers(
                 world, options.markers, world.sense.camera_height_m
             )
+        self._headings = None
+        if options.compass_deg is not None:
+            draw = np.random.default_rng([options.seed, 5]).standard_normal((2, self.n_frames))
+            times = np.arange(self.n_frames) / options.rate
+            slow = ornstein_uhlenbeck(draw[:1], times, _COMPASS_S)[0]
+            error = math.radians(options.compass_deg) * math.sqrt(0.5) * (draw[1] + slow)
+            self._headings = wrap_angles(self._truths[:, 2] + error)
         self._dark, self._blind = _span(options.dark), _span(options.blind)
         true = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), wrap_angles(moved[:, 2])])
         self._velocities = self.noise.apply(true * options.rate, options.seed)
@@ -280,6 +292,7 @@ class WorldSource(IndexedSource):
             image=image,
             velocity=velocity,
             ranges=ranges,
+            heading_rad=None if self._headings is None else float(self._headings[index]),
             landmarks=self._landmarks(index, pose) if self.options.landmark_reach else None,
             truth=pose,
         )

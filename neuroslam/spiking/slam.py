@@ -430,6 +430,9 @@ def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
 def _boxes_of(view: LandmarkView, n_landmarks: int) -> tuple[Tensor, Tensor]:
     """Boxes of each landmark, ``(landmarks, most boxes)``, and their shares by size."""
     owner = np.asarray(view.box_landmark)
+    if np.array_equal(owner, np.arange(n_landmarks)):
+        boxes = torch.arange(n_landmarks).unsqueeze(-1)
+        return boxes, torch.ones(boxes.shape, dtype=torch.float64)
     size = np.asarray(view.high_m)[0, 0] - np.asarray(view.low_m)[0, 0]
     measure = np.where(size > 0, size, 1.0).prod(-1)
     most = max(1, int(np.bincount(owner, minlength=n_landmarks).max()))

@@ -1,0 +1,607 @@
+"""The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
+
+import math
+from collections.abc import Callable
+from itertools import combinations
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuroslam.errors import BadFrame, MapError
+from neuroslam.geometry import wrap_angle
+from neuroslam.population import Join, Population, State, without_gradients
+from neuroslam.semantic_sections import SemanticConfig
+from neuroslam.sensors.landmarks import LandmarkView
+from neuroslam.spiking.decoding import PositionDecoder
+from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.types import Motion, Pose
+
+NAMED, VIEW, NAMELESS = 0, 1, 2
+"""Kinds of landmarks: with a number of its own, a known view, told apart by place alone."""
+
+_KINDS = ("landmark", "view", "nameless")
+_LEAST_SEEN = 3  # times that a landmark was seen, before it counts: outliers are seen once
+_KNOWN = 0.5  # strength of a recall from which a landmark is known
+_CONSENSUS = 3  # known landmarks in sight, from which on they can outvote one
+_MOVED_M = 0.05  # by which a landmark moves with its experience before memory is rewritten
+_NEAR_M = 0.5  # nearer landmarks say nothing of the heading
+
+
+class Sightings(NamedTuple):
+    """Landmarks in sight at one instant, ``(n,)`` each.
+
+    Attributes:
+        kind: ``NAMED``, ``VIEW`` or ``NAMELESS``.
+        number: Its own number; of nameless ones it does not count.
+        distance_m: From the robot.
+        bearing_rad: Relative to the heading.
+    """
+
+    kind: np.ndarray
+    number: np.ndarray
+    distance_m: np.ndarray
+    bearing_rad: np.ndarray
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> "Sightings":
+        """Take number, distance and bearing of landmarks, ``(n, 3)``.
+
+        Raises:
+            BadFrame: If the rows cannot be that.
+
+        Example:
+            >>> Sightings.of(np.array([[7.0, 2.0, 0.1]])).with_view(3).kind.tolist()
+            [0, 1]
+        """
+        rows = np.asarray(rows, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != 3:
+            raise BadFrame(
+                f"landmarks have shape {rows.shape}; expected (n, 3): number, distance, bearing"
+            )
+        if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
+            raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
+        kind = np.where(rows[:, 0] < 0, NAMELESS, NAMED)
+        return cls(kind, rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2])
+
+    def with_view(self, view: int) -> "Sightings":
+        """Add a known view: a landmark at which the robot stands when it sees it."""
+        row = (VIEW, view, 0.0, 0.0)
+        return Sightings(*(np.append(column, x) for column, x in zip(self, row, strict=True)))
+
+
+class Guide(NamedTuple):
+    """Where a map or other cells say that the robot is.
+
+    Attributes:
+        pose: Of the robot.
+        variance_m2: How sure that is.
+        experience: That the robot is at, on a map that is relaxed; -1: there is none.
+        poses: Of all experiences, ``(n, 3)``.
+    """
+
+    pose: Pose
+    variance_m2: float = 0.0
+    experience: int = -1
+    poses: np.ndarray = np.empty((0, 3))
+
+    @property
+    def at(self) -> np.ndarray:
+        """Pose of the experience that the robot is at, ``(3,)``."""
+        return self.poses[self.experience]
+
+
+class Told(NamedTuple):
+    """What the semantic cells say after a frame.
+
+    Attributes:
+        correction_m: By how much landmarks corrected the position just now.
+        turn_rad: And the heading.
+        place_m: Where a known landmark puts the robot; ``None``: no other than a moment ago.
+        variance_m2: How sure the robot was of its place when it learnt that landmark.
+        landmark: Row of the landmark that is attended to, or -1.
+        is_new: It is seen for the first time.
+        lost: A known landmark contradicts for long; the robot is where ``place_m`` says.
+    """
+
+    correction_m: tuple[float, float]
+    turn_rad: float
+    place_m: tuple[float, float] | None
+    variance_m2: float
+    landmark: int
+    is_new: bool
+    lost: bool
+
+
+class SemanticCells(Population):
+    r"""Learns where landmarks are, as vectors, and is corrected by those that it knows.
+
+    One animal of :class:`~neuroslam.spiking.slam.SSPSLAM`, with a vocabulary that grows: a pointer
+    of a landmark follows from its kind and number, so that it is the same in every session. Each
+    landmark in sight is first named: nameless ones by the place where they seem to be; those are
+    dropped that most others in sight contradict.
+
+    State: ``known``, a row for each landmark (kind, number, place as recalled, how often seen,
+    how sure the robot was of its own place), ``slam`` and the heading in ``now``.
+
+    Args:
+        config: Of SSP-SLAM and of what a landmark is.
+        heading_rad: At the start.
+        follows: ``nothing``: the cells are alone; ``map``: landmarks are kept with the experiences
+            of a map, and move with them; ``cells``: others believe where the robot is, and weigh
+            themselves what landmarks tell: the memory pulls at nothing.
+
+    Example:
+        >>> cells = SemanticCells(SemanticConfig())
+        >>> door = Sightings.of(np.array([[7.0, 2.0, 0.0]]))
+        >>> for _ in range(20):
+        ...     told = cells.live(Motion(0.0, 0.0, 0.1), door)
+        >>> cells.landmarks()["place_m"].round(1).tolist() == [[2, 0]]
+        True
+    """
+
+    def __init__(
+        self,
+        config: SemanticConfig,
+        heading_rad: float = 0.0,
+        follows: Literal["nothing", "map", "cells"] = "nothing",
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.follows = follows
+        self.known = GrowingTable(
+            {
+                "kind": ((), torch.int64),
+                "number": ((), torch.int64),
+                "place_m": ((2,), torch.float64),
+                "seen": ((), torch.int64),
+                "variance_m2": ((), torch.float64),
+                "first_frame": ((), torch.int64),
+                "experience": ((), torch.int64),
+                "offset_m": ((2,), torch.float64),
+            }
+        )
+        pulls = config.model_copy(update={"gain": 0.0}) if follows == "cells" else config
+        self.slam = SSPSLAM(pulls, _pointer(config, NAMED, 0)[None])
+        self.decoder = PositionDecoder(self.slam.space)
+        self.now = Scalars(
+            heading_rad=heading_rad,
+            owed_s=0.0,  # of time that no whole step has lived yet
+            frame=-1,
+            told=-1,  # landmark that has told where the robot is, in this turn of attention
+        )
+        self.slam.start(torch.zeros(1, 2))
+        self._rows: dict[tuple[int, int], int] = {}
+        self.register_load_state_dict_pre_hook(_take_pointers)
+        self.register_load_state_dict_post_hook(lambda module, _: module._index())
+
+    @property
+    def n(self) -> int:
+        """Number of landmarks that count: seen more than a time or two."""
+        return int((self.known["seen"] >= _LEAST_SEEN).sum())
+
+    @property
+    def pose(self) -> Pose:
+        """Where the cells say that the robot is."""
+        x, y = self.slam.integrator.position_m[0].tolist()
+        return Pose(x, y, self.now.heading_rad)
+
+    def landmarks(self) -> dict[str, np.ndarray]:
+        """Return the columns of the landmarks that count, and their names."""
+        rows = self.known["seen"] >= _LEAST_SEEN
+        columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
+        both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
+        return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
+
+    @without_gradients
+    def live(
+        self,
+        motion: Motion,
+        seen: Sightings,
+        *,
+        compass_rad: float | None = None,
+        guide: Guide | None = None,
+        frame: int = 0,
+    ) -> Told:
+        """Take in a frame.
+
+        Args:
+            motion: Since the last frame.
+            seen: Landmarks in sight at its end.
+            compass_rad: Measured heading; ``None``: it is integrated.
+            guide: Where a map or other cells say that the robot is; ``None``: it is alone.
+            frame: Number of the frame.
+
+        Raises:
+            MapError: If the robot leaves the space; nothing has changed then.
+        """
+        now, before = self.now, self.pose
+        if guide is None:
+            heading = compass_rad
+            if heading is None:
+                heading = wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
+            way = motion.v_m_s * motion.dt_s
+            step = way * math.cos(heading), way * math.sin(heading)
+            here = before.x_m + step[0], before.y_m + step[1]
+        else:
+            *here, heading = guide.pose
+            step = here[0] - before.x_m, here[1] - before.y_m
+        self._stay_inside(here)
+        now.heading_rad, now.frame = heading, frame
+        if guide is not None and math.hypot(*step) > float(self.slam.space.length_scale_m.min()):
+            self.slam.start(torch.tensor([here]))  # others have jumped
+            step = (0.0, 0.0)
+        angle = seen.bearing_rad + heading
+        vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * seen.distance_m[:, None]
+        places = np.array(here) + vectors
+        rows, fresh = self._name(seen, places, guide)
+        good = self._agreeing(rows, fresh, places)
+        rows, vectors, kind = rows[good], vectors[good], seen.kind[good]
+        attended, strength, gate, lost = self._steps(motion.dt_s, step, rows, vectors)
+        if attended < 0:
+            now.told = -1
+            return Told((0.0, 0.0), 0.0, None, 0.0, -1, False, False)
+        if strength > _KNOWN:
+            self._note_place(attended, guide)
+        place = None
+        if bool(self.slam.familiar[0]) and (now.told != attended or lost):
+            now.told = attended
+            vector = vectors[rows == attended][0]
+            place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
+        correction, turn = (0.0, 0.0), 0.0
+        if self.follows != "cells":
+            if guide is None or gate > 0.5 or lost:
+                after = self.pose
+                correction = after.x_m - here[0], after.y_m - here[1]
+            if compass_rad is None:
+                turn = self._turn(motion.dt_s, rows, vectors, kind)
+        sure = float(self.known["variance_m2"][attended])
+        new = bool(fresh[good][rows == attended].any())
+        return Told(correction, turn, place, sure, attended, new, lost)
+
+    @without_gradients
+    def follow_map(self, poses: np.ndarray) -> bool:
+        """Move landmarks with the experiences at which they were met, as the map was relaxed.
+
+        Args:
+            poses: Of all experiences, ``(n, 3)``.
+
+        Returns:
+            Whether one moved so far that the memory was written anew.
+        """
+        anchor = self.known["experience"].numpy()
+        rows = np.flatnonzero(anchor >= 0)
+        if not len(rows):
+            return False
+        place = self.known["place_m"].numpy()
+        there = from_frame(poses[anchor[rows]], self.known["offset_m"].numpy()[rows])
+        if np.abs(there - place[rows]).max() < _MOVED_M:
+            return False
+        self.known["place_m"][rows] = torch.from_numpy(there)
+        self._write()
+        return True
+
+    def _write(self) -> None:
+        """Make every landmark recall the place where it is noted to be."""
+        slam = self.slam
+        places = slam.space.encode(self.known["place_m"].to(slam.pointers)).detach()
+        slam.map.write(slam.pointers, places)
+        if slam.places is not None:
+            slam.places.write(places, slam.pointers)
+
+    def go_to(self, place_m: tuple[float, float]) -> None:
+        """Put the animal somewhere; what it has learnt stays."""
+        self._stay_inside(place_m)
+        self.slam.start(torch.tensor([place_m]))
+
+    def _stay_inside(self, place_m: tuple[float, float]) -> None:
+        low, high = self.slam.space.bounds_m.T.tolist()
+        if not all(a <= x <= b for a, x, b in zip(low, place_m, high, strict=True)):
+            raise MapError(
+                f"semantic map: the robot is at {place_m[0]:.1f}, {place_m[1]:.1f} m, outside of "
+                f"its space of +-{high[0]:g} m; raise semantic.space.reach_m"
+            )
+
+    def _name(
+        self, seen: Sightings, places_m: np.ndarray, guide: Guide | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Say which row each landmark in sight has, -1 for none, and which rows are new."""
+        rows = np.full(len(seen.kind), -1)
+        fresh = np.zeros(len(rows), dtype=bool)
+        for i, (kind, number) in enumerate(zip(seen.kind.tolist(), seen.number.tolist(),
+                                               strict=True)):  # fmt: skip
+            if kind == NAMELESS:
+                rows[i], number = self._nearest(places_m[i])
+            else:
+                rows[i] = self._rows.get((kind, number), -1)
+            if rows[i] < 0 and number >= 0:
+                rows[i], fresh[i] = self._meet(kind, number, places_m[i], guide), True
+            if rows[i] >= 0:
+                self.known["seen"][rows[i]] += 1
+        return rows, fresh
+
+    def _nearest(self, place_m: np.ndarray) -> tuple[int, int]:
+        """Row of the nameless landmark there, or -1 and a number for it, or none where in doubt."""
+        mine = np.flatnonzero(self.known["kind"].numpy() == NAMELESS)
+        if not len(mine):
+            return -1, 0
+        away = np.linalg.norm(self.known["place_m"].numpy()[mine] - place_m, axis=1)
+        order = np.argsort(away)
+        same = self.config.same_m
+        if away[order[0]] > 2.0 * same:
+            return -1, len(mine)
+        doubtful = len(away) > 1 and away[order[1]] < 2.0 * away[order[0]]
+        if away[order[0]] > same or doubtful:
+            return -1, -1
+        return int(mine[order[0]]), 0
+
+    def _meet(self, kind: int, number: int, place_m: np.ndarray, guide: Guide | None) -> int:
+        """Take a landmark into the vocabulary."""
+        experience, offset = -1, np.zeros(2)
+        if guide is not None and guide.experience >= 0:
+            experience, offset = guide.experience, into_frame(guide.at, place_m)
+        row = self.known.append(
+            kind=kind,
+            number=number,
+            place_m=torch.from_numpy(place_m),
+            seen=0,
+            variance_m2=0.0 if guide is None else guide.variance_m2,
+            first_frame=self.now.frame,
+            experience=experience,
+            offset_m=torch.from_numpy(offset),
+        )
+        pointer = _pointer(self.config, kind, number)[None].to(self.slam.pointers)
+        self.slam.pointers = torch.cat([self.slam.pointers[:row], pointer])
+        self._rows[kind, number] = row
+        return row
+
+    def _agreeing(self, rows: np.ndarray, fresh: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+        """Tell which landmarks in sight most others do not contradict."""
+        good = rows >= 0
+        known = good & ~fresh
+        if known.sum() < _CONSENSUS:
+            return good
+        off = places_m[known] - self.known["place_m"].numpy()[rows[known]]
+        apart = np.linalg.norm(off - np.median(off, axis=0), axis=1)
+        limit = max(3.0 * self.config.sigma_m, 3.0 * float(np.median(apart)))
+        good[known] = apart <= limit
+        return good
+
+    def _steps(
+        self, dt_s: float, step_m: tuple[float, float], rows: np.ndarray, vectors: np.ndarray
+    ) -> tuple[int, float, float, bool]:
+        """Let SSP-SLAM live for the time of a frame; returns its last step.
+
+        Returns:
+            Landmark attended to or -1, how strongly it is recalled, how far the gate is open, and
+            whether it is believed against the path.
+        """
+        slam, now, dt = self.slam, self.now, self.config.time_step_s
+        now.owed_s += dt_s
+        steps = math.floor(now.owed_s / dt + 1e-6)
+        if steps == 0:  # frames are shorter than steps
+            now.owed_s -= dt_s
+            steps, now.owed_s = 1, 0.0
+        else:
+            now.owed_s -= steps * dt
+        n = len(slam.pointers)
+        in_view = np.zeros(n, dtype=bool)
+        in_view[rows] = True
+        low = np.zeros((n, 2))
+        low[rows] = vectors
+        distance = np.hypot(*low.T)
+        in_view, distance = (np.tile(part, (steps, 1, 1)) for part in (in_view, distance))
+        low = np.tile(low, (steps, 1, 1, 1))
+        view = LandmarkView(in_view, distance, low, low, np.arange(n))
+        velocity = torch.tensor(step_m) / (steps * dt)
+        said = slam.run(velocity.expand(steps, 1, 2), view)
+        recall, gate, lost, attended = (
+            part[-1, 0].item() for part in (said.recall, said.gate, said.lost, said.attended)
+        )
+        return attended, recall, gate, lost and bool(slam.familiar[0])
+
+    def _note_place(self, row: int, guide: Guide | None) -> None:
+        """Read out where the landmark is that is recalled."""
+        recalled = torch.view_as_complex(self.slam.recalled)
+        start = self.known["place_m"][row][None].to(recalled.real)
+        place = self.decoder.track(recalled, start)[0].double()
+        anchor = int(self.known["experience"][row])
+        if anchor >= 0:
+            at = guide.poses[anchor]
+            self.known["offset_m"][row] = torch.from_numpy(into_frame(at, place.numpy()))
+        self.known["place_m"][row] = place
+
+    def _turn(self, dt_s: float, rows: np.ndarray, vectors: np.ndarray, kind: np.ndarray) -> float:
+        r"""Correct an integrated heading by the bearings of known landmarks.
+
+        .. math:: \theta \leftarrow \theta - \kappa\,\Delta t\;
+                  \mathrm{mean}_i\,\angle\bigl(d_i,\, m_i - x\bigr)
+
+        with :math:`d_i` the vector seen and :math:`m_i` where the landmark is recalled to be.
+        """
+        known = (kind != VIEW) & (self.known["seen"].numpy()[rows] >= _LEAST_SEEN)
+        expected = self.known["place_m"].numpy()[rows] - np.array(self.pose[:2])
+        known &= np.minimum(np.hypot(*expected.T), np.hypot(*vectors.T)) > _NEAR_M
+        if not known.any():
+            return 0.0
+        (a, b), (x, y) = expected[known].T, vectors[known].T
+        off = np.arctan2(a * y - b * x, a * x + b * y).mean()
+        turn = -min(1.0, self.config.heading_rate_hz * dt_s) * float(off)
+        self.now.heading_rad = wrap_angle(self.now.heading_rad + turn)
+        return turn
+
+    def _index(self) -> None:
+        kinds, numbers = (self.known[c].tolist() for c in ("kind", "number"))
+        self._rows = {key: i for i, key in enumerate(zip(kinds, numbers, strict=True))}
+
+    @torch.no_grad()
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Join the landmarks of two sessions in the frame of the loaded one, and write them anew.
+
+        Landmarks of one name are one, views as the maps' are, nameless ones where they lie
+        together. One that lies elsewhere now is where the partial session, the younger, saw it.
+        """
+        one, other = (SemanticCells(self.config, follows=self.follows) for _ in range(2))
+        one.load_state_dict(loaded)
+        other.load_state_dict(partial)
+        there = self._moved(other.known["place_m"].numpy(), join)
+        keys = {key: row for row, key in enumerate(one._rows)}
+        columns = {c: one.known[c].tolist() for c in one.known.columns}
+        free = sum(kind == NAMELESS for kind, _ in keys)
+        for row, (kind, number) in enumerate(other._rows):
+            if kind == VIEW:
+                number = int(join.views[number])
+            elif kind == NAMELESS:
+                number, free = _same_nameless(one, there[row], free)
+            theirs = {c: other.known[c][row].tolist() for c in columns}
+            at = keys.get((kind, number))
+            if theirs["experience"] >= 0:
+                theirs["experience"] = int(join.experiences[theirs["experience"]])
+                turn = float(join.turns_rad[other.known["experience"][row]])
+                theirs["offset_m"] = _rotated(np.array(theirs["offset_m"]), turn).tolist()
+            if at is None:
+                keys[kind, number] = len(columns["kind"])
+                for c, value in (
+                    theirs | {"number": number, "place_m": there[row].tolist()}
+                ).items():
+                    columns[c].append(value)
+                continue
+            mine = np.array(columns["place_m"][at])
+            agree = np.linalg.norm(mine - there[row]) < self.config.same_m
+            columns["place_m"][at] = ((mine + there[row]) / 2 if agree else there[row]).tolist()
+            columns["seen"][at] += theirs["seen"]
+            columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
+        return self._written(other, columns, join)
+
+    def _moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
+        """Bring positions of the partial session, ``(n, 2)``, into the loaded one's frame."""
+        if self.follows == "map":
+            return join.place(np.column_stack([points_m, np.zeros(len(points_m))]))[:, :2]
+        return join.place_cells(points_m)
+
+    def _written(self, session: "SemanticCells", columns: dict[str, list], join: Join) -> State:
+        """Write landmarks into a fresh memory, with which the session goes on."""
+        merged = SemanticCells(self.config, follows=self.follows)
+        dtypes = {c: session.known[c].dtype for c in columns}
+        shape = {c: session.known[c].shape[1:] for c in columns}
+        merged.known.replace(
+            **{
+                c: torch.tensor(v, dtype=dtypes[c]).reshape(-1, *shape[c])
+                for c, v in columns.items()
+            }
+        )
+        merged._index()
+        slam = merged.slam
+        if merged._rows:
+            pointers = torch.stack([_pointer(self.config, *key) for key in merged._rows])
+            slam.pointers = pointers.to(slam.pointers)
+            merged._write()
+        now = self._moved(np.array([session.pose[:2]]), join)[0]
+        slam.time_s = session.slam.time_s.clone()
+        slam.start(torch.tensor(now[None]))
+        for name in session.now.kinds:
+            setattr(merged.now, name, getattr(session.now, name))
+        turn = join.rotation_rad if self.follows == "map" else join.cells_turn_rad
+        merged.now.heading_rad = wrap_angle(session.now.heading_rad + turn)
+        merged.now.told = -1
+        return merged.state_dict()
+
+
+def into_frame(pose: np.ndarray, point_m: np.ndarray) -> np.ndarray:
+    """Express a point, ``(2,)``, in the frame of a pose, ``(3,)``.
+
+    Example:
+        >>> into_frame(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0])).round(6).tolist()
+        [2.0, 0.0]
+    """
+    return _rotated(point_m - pose[:2], -pose[2])
+
+
+def from_frame(poses: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    """Undo :func:`into_frame`, for many: ``(n, 3)`` and ``(n, 2)``."""
+    return poses[:, :2] + _rotated(points_m, poses[:, 2])
+
+
+def _rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
+    c, s = np.cos(by_rad), np.sin(by_rad)
+    x, y = points_m[..., 0], points_m[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def shared_frames(
+    loaded: State, partial: State, confirm: int = 2, same_m: float = 1.0
+) -> tuple[Pose, Pose] | None:
+    """Say how two semantic maps lie by the named landmarks that both know.
+
+    The largest group of them that one turn and one shift bring together within ``same_m`` is
+    believed.
+
+    Returns:
+        A pose in the partial map's frame, and the same in the loaded one's; ``None`` where fewer
+        than ``confirm`` agree, or no more than those that do not.
+    """
+    tables = [
+        {
+            (kind, number): place
+            for kind, number, seen, place in zip(
+                *(state[f"known.{c}"].tolist() for c in ("kind", "number", "seen", "place_m")),
+                strict=True,
+            )
+            if kind == NAMED and seen >= _LEAST_SEEN
+        }
+        for state in (loaded, partial)
+    ]
+    both = sorted(tables[0].keys() & tables[1].keys())
+    if len(both) < max(confirm, 2):
+        return None
+    onto, start = (np.array([table[key] for key in both]) for table in tables)
+    best = None
+    for i, j in combinations(range(len(both)), 2):
+        if np.linalg.norm(start[i] - start[j]) < same_m:
+            continue
+        fit = _laid(start[[i, j]], onto[[i, j]])
+        near = np.linalg.norm(fit(start) - onto, axis=1) <= same_m
+        if best is None or near.sum() > best.sum():
+            best = near
+    if best is None or best.sum() < confirm or 2 * best.sum() <= len(both):
+        return None
+    turn = _turn_between(start[best], onto[best])
+    return Pose(*start[best].mean(0).tolist(), 0.0), Pose(*onto[best].mean(0).tolist(), turn)
+
+
+def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:
+    """Turn of one set of points that fits it best to another, least squares."""
+    a, b = start_m - start_m.mean(0), onto_m - onto_m.mean(0)
+    across = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return math.atan2(across.sum(), (a * b).sum())
+
+
+def _laid(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    turn = _turn_between(start_m, onto_m)
+    c, s = math.cos(turn), math.sin(turn)
+    way = np.array([[c, s], [-s, c]])
+    return lambda points: (points - start_m.mean(0)) @ way + onto_m.mean(0)
+
+
+def _same_nameless(one: SemanticCells, place_m: np.ndarray, free: int) -> tuple[int, int]:
+    """Number that a nameless landmark gets in a merge, and the next that is free."""
+    row, _ = one._nearest(place_m)
+    return (int(one.known["number"][row]), free) if row >= 0 else (free, free + 1)
+
+
+def _pointer(config: SemanticConfig, kind: int, number: int) -> Tensor:
+    """Pointer of a landmark: random, of length 1, the same in every session."""
+    draw = torch.Generator().manual_seed((config.seed * 3 + kind) * 1_000_003 + number)
+    vector = torch.randn(config.key_features, generator=draw)
+    return vector / vector.norm()
+
+
+def _take_pointers(
+    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+) -> None:
+    """Make room for as many pointers as a state has."""
+    saved = state.get(f"{prefix}slam.pointers")
+    if saved is not None:
+        module.slam.pointers = module.slam.pointers.new_empty(saved.shape)
