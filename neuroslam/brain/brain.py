@@ -170,12 +170,15 @@ class NavigationBrain(nn.Module):
         if self.config.has("semantic"):
             told = self._meet_landmarks(frame, motion, sensed.landmarks, view)
             lost = lost or told.lost
-            if not self.config.has("place"):
-                place = told.landmark
         if not self.config.has("pose"):
-            pose = self.navigation.pose if self.config.has("place") else self.semantic.pose
+            at = None
+            if self.config.has("place"):
+                pose = self.navigation.pose
+            else:
+                pose = self.semantic.pose
+                place, at = self.semantic.place_of(told.landmark, self.map.n)
             cells = PoseEstimate(pose.x_m, pose.y_m, 0.0)
-            action, experience = self.map.visit(place, pose, dt_s, frame.index)
+            action, experience = self.map.visit(place, pose, dt_s, frame.index, at)
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
         self.clock.after_gap_s = -math.inf

@@ -11,7 +11,7 @@ from neuroslam.checked_files import first_line, load_checked, save_checked
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> None:
@@ -37,8 +37,10 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         config = build_config(about.get("config", {}), origin=str(path))
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
-    if about["format"] < FORMAT_VERSION:
-        tensors = _upgraded(tensors, config, about["sha256"])
+    if about["format"] == 1:
+        tensors = _of_one_session(tensors, config, about["sha256"])
+    elif about["format"] == 2:
+        tensors = _with_compass(tensors, config)
     return config, tensors
 
 
@@ -59,7 +61,16 @@ def load_brain(path: str | Path) -> NavigationBrain:
     return brain
 
 
-def _upgraded(tensors: dict[str, Tensor], config: BrainConfig, digest: str) -> dict[str, Tensor]:
+def _with_compass(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, Tensor]:
+    """Bring a state of format 2, which knew no compass, to the present one."""
+    brains = [name.removesuffix("clock.frame") for name in tensors if name.endswith("clock.frame")]
+    fresh = NavigationBrain(config).compass.state_dict()
+    return tensors | {f"{one}compass.{name}": v for one in brains for name, v in fresh.items()}
+
+
+def _of_one_session(
+    tensors: dict[str, Tensor], config: BrainConfig, digest: str
+) -> dict[str, Tensor]:
     """Bring a state of format 1, which knew no sessions, to the present one: it is one session."""
     brain = NavigationBrain(config)
     session = session_id(digest)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from neuroslam.brain.landmark_matching import match_landmarks
 from neuroslam.brain.limits import elsewhere, far_off, tolerance
 from neuroslam.brain.merge import Match, differing_keys
 from neuroslam.brain.sessions import session_name
@@ -53,8 +54,10 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     shared = shared_history(loaded, partial)
     if shared is not None:
         return shared
-    if not partial.config.has("pose"):
+    if partial.config.has("place") and not partial.config.has("pose"):
         return Found(*match_walls(loaded, partial))
+    if not partial.config.has("pose"):
+        return Found(*match_landmarks(loaded, partial))
     pairs, best = _alike(loaded, partial)
     threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
     if not len(pairs.partial):

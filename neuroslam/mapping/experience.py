@@ -218,15 +218,18 @@ class ExperienceMap(Population):
         self._drop_finished_goals()
         return action, self.state.current
 
-    def visit(self, place: int, pose: Pose, elapsed_s: float, frame: int) -> tuple[Action, int]:
-        """Take in where place cells say that the robot is; each of them is an experience.
+    def visit(
+        self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None
+    ) -> tuple[Action, int]:
+        """Take in where cells say that the robot is; each place cell, or landmark, is a place.
 
         Args:
-            place: Number of the place cell; that of the next experience for a new one; -1 where
-                the robot does not know its place.
+            place: Number of it; that of the next experience for a new one; -1 where the robot
+                does not know its place.
             pose: Of the robot, on this map.
             elapsed_s: Time since the last frame.
             frame: Number of the frame.
+            at: Where the place is; ``None``: where the robot is.
 
         Returns:
             What was done, and the experience the robot is at.
@@ -237,6 +240,7 @@ class ExperienceMap(Population):
         self.stand(pose)
         if place not in (NO_EXPERIENCE, self.state.current):
             action = "create" if place == self.n else "link"
+            self.stand(at or pose)
             if action == "create":
                 self.create(NO_TEMPLATE, PoseEstimate(0.0, 0.0, 0.0), frame)
             else:

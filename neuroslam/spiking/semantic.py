@@ -291,6 +291,20 @@ class SemanticCells(Population):
         if slam.places is not None:
             slam.places.write(places, slam.pointers)
 
+    def place_of(self, row: int, n: int) -> tuple[int, Pose | None]:
+        """Return the place of a map that a landmark is, and where; each is one, where it is alone.
+
+        Args:
+            row: Of the landmark, or -1.
+            n: Places that the map has; a landmark that is none becomes the next.
+        """
+        if row < 0 or int(self.known["seen"][row]) < _LEAST_SEEN:
+            return -1, None
+        if int(self.known["experience"][row]) < 0:
+            self.known["experience"][row] = n
+        x, y = self.known["place_m"][row].tolist()
+        return int(self.known["experience"][row]), Pose(x, y, self.now.heading_rad)
+
     def go_to(self, place_m: tuple[float, float]) -> None:
         """Put the animal somewhere; what it has learnt stays."""
         self._stay_inside(place_m)
@@ -340,7 +354,7 @@ class SemanticCells(Population):
     def _meet(self, kind: int, number: int, place_m: np.ndarray, guide: Guide | None) -> int:
         """Take a landmark into the vocabulary."""
         experience, offset = -1, np.zeros(2)
-        if guide is not None and guide.experience >= 0:
+        if guide is not None and guide.experience >= 0:  # on a map that is relaxed
             experience, offset = guide.experience, into_frame(guide.at, place_m)
         row = self.known.append(
             kind=kind,
@@ -408,7 +422,7 @@ class SemanticCells(Population):
         start = self.known["place_m"][row][None].to(recalled.real)
         place = self.decoder.track(recalled, start)[0].double()
         anchor = int(self.known["experience"][row])
-        if anchor >= 0:
+        if anchor >= 0 and self.follows == "map":
             at = guide.poses[anchor]
             self.known["offset_m"][row] = torch.from_numpy(into_frame(at, place.numpy()))
         self.known["place_m"][row] = place
