@@ -220,8 +220,7 @@ class NavigationBrain(nn.Module):
                 landmarks.append(self._markers(image))
         if config.has("pose") and image is not None:
             view = self.view.look(image)
-        rows = np.concatenate(landmarks) if landmarks else np.empty((0, 3))
-        return Sensed(view, walls, Sightings.of(rows))
+        return Sensed(view, walls, Sightings.of(*landmarks))
 
     @cached_property
     def _markers(self) -> MarkerDetector:

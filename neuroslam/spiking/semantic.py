@@ -46,8 +46,8 @@ class Sightings(NamedTuple):
     bearing_rad: np.ndarray
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> "Sightings":
-        """Take number, distance and bearing of landmarks, ``(n, 3)``.
+    def of(cls, *tables: np.ndarray) -> "Sightings":
+        """Take number, distance and bearing of landmarks, ``(n, 3)`` of each sensor.
 
         Raises:
             BadFrame: If the rows cannot be that.
@@ -56,11 +56,13 @@ class Sightings(NamedTuple):
             >>> Sightings.of(np.array([[7.0, 2.0, 0.1]])).with_view(3).kind.tolist()
             [0, 1]
         """
-        rows = np.asarray(rows, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != 3:
-            raise BadFrame(
-                f"landmarks have shape {rows.shape}; expected (n, 3): number, distance, bearing"
-            )
+        tables = tuple(np.asarray(rows, dtype=np.float64) for rows in tables)
+        for rows in tables:
+            if rows.ndim != 2 or rows.shape[1] != 3:
+                raise BadFrame(
+                    f"landmarks have shape {rows.shape}; expected (n, 3): number, distance, bearing"
+                )
+        rows = np.concatenate((np.empty((0, 3)), *tables))
         if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
             raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
         kind = np.where(rows[:, 0] < 0, NAMELESS, NAMED)
@@ -180,7 +182,11 @@ class SemanticCells(Population):
     @property
     def n(self) -> int:
         """Number of landmarks that count: seen more than a time or two."""
-        return int((self.known["seen"] >= _LEAST_SEEN).sum())
+        return int(self._counts().sum())
+
+    def _counts(self) -> Tensor:
+        """Tell which landmarks were seen so often that they are none by mistake."""
+        return (self.known["seen"] >= _LEAST_SEEN) | (self.known["kind"] == VIEW)
 
     @property
     def pose(self) -> Pose:
@@ -190,7 +196,7 @@ class SemanticCells(Population):
 
     def landmarks(self) -> dict[str, np.ndarray]:
         """Return the columns of the landmarks that count, and their names."""
-        rows = self.known["seen"] >= _LEAST_SEEN
+        rows = self._counts()
         columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
         both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
         return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
@@ -250,6 +256,8 @@ class SemanticCells(Population):
             now.told = attended
             vector = vectors[rows == attended][0]
             place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
+        if lost:  # its landmarks contradict for long: it was carried, or has drifted far
+            self.go_to(place)
         correction, turn = (0.0, 0.0), 0.0
         if self.follows != "cells":
             if guide is None or gate > 0.5 or lost:
