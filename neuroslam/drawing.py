@@ -25,6 +25,7 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.types import Pose, PoseEstimate
 
 ODOMETRY, MAP, LOOP, TRUTH = "#8c8c8c", "#0072B2", "#D55E00", "#000000"
+LANDMARK = "#F0E442"
 ROBOT, OTHER, INK, WALL = "#E69F00", "#009E73", "#222222", "#c9c9c9"
 CURVES = (MAP, LOOP, OTHER, "#CC79A7", "#E69F00", "#56B4E9")
 ACTIVITY = "viridis"
@@ -59,6 +60,7 @@ class _Placed(NamedTuple):
     truth: np.ndarray | None
     current: Pose | None
     label: str
+    landmarks: np.ndarray
 
 
 def _place(
@@ -66,9 +68,10 @@ def _place(
     track: np.ndarray | None,
     truth: np.ndarray | None,
     current: Pose | None,
+    landmarks: np.ndarray,
 ) -> _Placed:
     if truth is None or not len(truth):
-        return _Placed(poses, None, current, "")
+        return _Placed(poses, None, current, "", landmarks)
     track = poses[:, :2] if track is None else np.asarray(track)
     truth = np.asarray(truth)
     if len(track) != len(truth):
@@ -87,7 +90,8 @@ def _place(
     if current is not None:
         x, y = motion.apply(np.array([current[:2]]))[0]
         current = Pose(float(x), float(y), current.theta_rad + turn)
-    return _Placed(moved, truth, current, f"truth: ATE {_metres(ate)}, {how}")
+    landmarks = motion.apply(landmarks)
+    return _Placed(moved, truth, current, f"truth: ATE {_metres(ate)}, {how}", landmarks)
 
 
 def draw_odometry(axes: Axes, xy: np.ndarray) -> None:
@@ -106,10 +110,12 @@ def draw_map(
     truth: np.ndarray | None,
     walls: np.ndarray | None,
     current: Pose | None,
+    landmarks: np.ndarray | None = None,
 ) -> None:
-    """Draw experiences, links, loop closures, truth and robot, where the truth puts them."""
+    """Draw experiences, links, loop closures, landmarks, truth and robot, where the truth is."""
     poses, links = np.asarray(poses).reshape(-1, 3), np.asarray(links, np.int64).reshape(-1, 2)
-    poses, truth, current, truth_label = _place(poses, track, truth, current)
+    spots = np.empty((0, 2)) if landmarks is None else np.asarray(landmarks).reshape(-1, 2)
+    poses, truth, current, truth_label, spots = _place(poses, track, truth, current, spots)
     xy = poses[:, :2]
     if walls is not None:
         segments = np.asarray(walls).reshape(-1, 2, 2)
@@ -127,6 +133,9 @@ def draw_map(
         )
     if truth is not None:
         axes.plot(*truth.T, "--", color=TRUTH, lw=0.9, zorder=5, label=truth_label)
+    if len(spots):
+        style = {"ls": "none", "marker": "*", "ms": 10, "mfc": LANDMARK, "mec": INK, "mew": 0.5}
+        axes.plot(*spots.T, zorder=6, label="landmarks", **style)
     _draw_ends(axes, xy, end=current is None)
     if current is not None:
         marker = MarkerStyle(_DART).rotated(rad=current.theta_rad)

@@ -24,7 +24,14 @@ from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links, closes_loop
 from neuroslam.population import State
-from neuroslam.run_files import brain_file, experiences_csv, links_csv, read_trace, trajectory
+from neuroslam.run_files import (
+    brain_file,
+    experiences_csv,
+    landmarks_csv,
+    links_csv,
+    read_trace,
+    trajectory,
+)
 from neuroslam.storage import GrowingTable
 
 _SUM_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
@@ -68,7 +75,7 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
         ("view", f"{view.template_width} x {view.template_height} px, threshold {view.threshold}"),
-        ("cells", config.cells),
+        ("cells", "+".join(config.cells)),
         ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
     ]
     origins = brain.map.origins()
@@ -93,6 +100,7 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
         *_navigation_counts(brain),
+        *([("landmarks", str(brain.semantic.n))] if brain.config.has("semantic") else []),
     ]
 
 
@@ -242,7 +250,19 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
     yield from _cell_faults(state, config)
     if config.has("place"):
         yield from _navigation_faults(s, n if not config.has("pose") else None)
+    if config.has("semantic"):
+        yield from _semantic_faults(s, n)
     yield from _origin_faults(s, n)
+
+
+def _semantic_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
+    pointers, kinds = len(s["semantic.slam.pointers"]), len(s["semantic.known.kind"])
+    if pointers != max(1, kinds):
+        yield f"{kinds} landmarks, {pointers} pointers; each should have its own"
+    at = s["semantic.known.experience"]
+    rows = np.flatnonzero((at < -1) | (at >= n))
+    if len(rows):
+        yield f"landmarks {_some(rows)}: met at experiences {_some(at[rows])}, there are {n}"
 
 
 def _link_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
@@ -354,6 +374,8 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "experiences.csv": experiences_csv(brain),
         "links.csv": links_csv(brain.map.links),
     }
+    if brain.config.has("semantic"):
+        expected["landmarks.csv"] = landmarks_csv(brain)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:

@@ -60,6 +60,7 @@ def plot_map(
     truth_xy: np.ndarray | None = None,
     walls: np.ndarray | None = None,
     current: Pose | None = None,
+    landmarks: np.ndarray | None = None,
     title: str | None = None,
 ) -> Figure:
     """Draw the experience map, beside the odometry it was made from.
@@ -76,6 +77,7 @@ def plot_map(
         truth_xy: Where it was in each frame, ``(t, 2)``; without ``track_xy``: at each experience.
         walls: Ends of wall segments in the frame of the truth, ``(w, 2, 2)``.
         current: Pose of the robot now, on the map: an arrow, which stands for the end.
+        landmarks: Where landmarks are, on the map, ``(l, 2)``: stars.
         title: Heading of the whole figure.
 
     Raises:
@@ -86,7 +88,7 @@ def plot_map(
         axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
             draw_odometry(axes[0], np.asarray(odometry_xy))
-        draw_map(axes[-1], poses, links, track_xy, truth_xy, walls, current)
+        draw_map(axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks)
     return figure
 
 

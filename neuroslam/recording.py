@@ -147,13 +147,19 @@ class TensorBoardRecorder(Recorder):
             values["cells/peak"] = brain.pose_cells.peak
         if self._cells is not None:
             values |= self._cells.scalars(brain)
+        if brain.config.has("semantic"):
+            values["semantic/landmarks"] = brain.semantic.n
+            values["semantic/contradicted_s"] = float(brain.semantic.slam.contradicted_s[0])
         for tag, value in values.items():
             self._writer.add_scalar(tag, value, result.frame)
 
     def _write_map(self, frame: int, brain: "NavigationBrain", last: bool = False) -> None:
         links = brain.map.links
         figure = plot_map(
-            brain.map.poses, np.column_stack([links.source, links.target]), current=brain.map.pose
+            brain.map.poses,
+            np.column_stack([links.source, links.target]),
+            current=brain.map.pose,
+            landmarks=brain.landmarks_m,
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
         if self._cells is not None and (last or frame >= self._cells_due):

@@ -111,6 +111,7 @@ def draw_map(
         track_xy=track[on_map],
         truth_xy=None if truth is None else truth[on_map, :2],
         current=brain.map.pose,
+        landmarks=brain.landmarks_m,
         title=f"{name}: {len(trace['time_s'])} frames",
     )
     with warnings.catch_warnings():

@@ -34,7 +34,7 @@ TRACE_COLUMNS = (
 
 RUN_FILES = (
     "frames.csv", "trace.f64", "config.toml", "metrics.json", "brain.safetensors",
-    "experiences.csv", "links.csv", "trajectory.tum", "map.png",
+    "experiences.csv", "links.csv", "landmarks.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
 
 
@@ -232,6 +232,15 @@ def experiences_csv(brain: NavigationBrain) -> str:
     )
     lines = [f"{i},{x!r},{y!r},{t!r},{v},{f}" for i, ((x, y, t), v, f) in enumerate(rows)]
     return "\n".join(["id,x_m,y_m,theta_rad,template,first_frame", *lines]) + "\n"
+
+
+def landmarks_csv(brain: NavigationBrain) -> str:
+    """Write what the semantic map knows: name,x_m,y_m,seen,first_frame,experience."""
+    known = brain.semantic.landmarks()
+    columns = ("name", "place_m", "seen", "first_frame", "experience")
+    rows = zip(*(known[column].tolist() for column in columns), strict=True)
+    lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e in rows]
+    return "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines]) + "\n"
 
 
 def links_csv(links: Links) -> str:

@@ -37,6 +37,7 @@ from neuroslam.run_files import (
     RunPlan,
     brain_file,
     experiences_csv,
+    landmarks_csv,
     links_csv,
     odometry_track,
     read_plan,
@@ -365,6 +366,8 @@ def write_results(
             "activated_boundary_cells": int(cells.familiarity.n_activated()),
             "lost_s": round(cells.now.lost_s, 3),
         }
+    if brain.config.has("semantic"):
+        summary.counts["landmarks"] = brain.semantic.n
     if truth is not None:
         # A robot that has not moved: nothing tells how to lay its track over the truth.
         with contextlib.suppress(MapError):
@@ -381,6 +384,8 @@ def write_results(
         save_brain(brain, out / "brain.safetensors")
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
+        if brain.config.has("semantic"):
+            write_text(out / "landmarks.csv", landmarks_csv(brain))
         write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
         draw_map(brain, plan, trace, out / "map.png")
     except OSError as error:

@@ -27,7 +27,7 @@ from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.population import Population, Running, State
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
-from neuroslam.spiking.semantic import Guide, SemanticCells, Sightings, Told
+from neuroslam.spiking.semantic import VIEW, Guide, SemanticCells, Sightings, Told
 from neuroslam.storage import Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
@@ -477,6 +477,14 @@ class NavigationBrain(nn.Module):
                 self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
             )
         ]
+
+    @property
+    def landmarks_m(self) -> np.ndarray | None:
+        """Where landmarks are on the map, ``(n, 2)``, views left out; ``None``: it has no cells."""
+        if not self.config.has("semantic"):
+            return None
+        known = self.semantic.landmarks()
+        return known["place_m"][known["kind"] != VIEW]
 
     def place(self, experience: int, offset: Pose) -> Pose:
         """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.
