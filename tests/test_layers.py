@@ -8,12 +8,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 FLOW = [
-    "errors", "types", "geometry", "sections", "config", "semantic_sections",
+    "errors", "types", "geometry", "sections", "semantic_sections", "config",
     "storage", "checked_files", "population", "vision",
     "sensors", "odometry", "view", "cells", "spiking", "mapping", "brain",
     "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "spike_drawing",
     "semantic_drawing", "cell_panels", "semantic_panels",
-    "merge_drawing", "recording", "run_files",
+    "merge_drawing", "comparison_drawing", "recording", "run_files",
     "inspection", "export",
     "review", "runs", "merging", "demo",
     "experiments", "cli",

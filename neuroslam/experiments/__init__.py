@@ -17,6 +17,7 @@ EXPERIMENTS = {
     "five-sessions": (_SESSIONS, "five_sessions", None),
     "campus": (_SESSIONS, "campus", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
+    "compare": ("neuroslam.experiments.compare", "compare", None),
     "boundary-scenarios": (
         "neuroslam.experiments.boundary_cells",
         "boundary_scenarios",

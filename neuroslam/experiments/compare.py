@@ -1,0 +1,199 @@
+"""All methods side by side: one world, one noise, one seed, and the same frames for each."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from neuroslam.brain import NavigationBrain
+from neuroslam.comparison_drawing import plot_comparison, plot_losses
+from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
+from neuroslam.evaluation.trajectory import align
+from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.geometry import integrate_velocities
+from neuroslam.plotting import save
+from neuroslam.runs import one_thread
+from neuroslam.sensors import open_source
+from neuroslam.types import NO_EXPERIENCE, Frame, Pose
+
+WORLDS = ("corridor", "ellipse")
+SENSES = "noise=0.05&compass_deg=3&ranges=72&markers=12&landmark_reach=6"
+"""What all methods have in common; each takes of it what it has cells for."""
+
+_NEURONS = {
+    "time_step_s": 0.001,
+    "space": {"n_rotations": 3, "n_scales": 3},
+    "integrator": {"neurons": 300},
+    "map": {"neurons": 1000, "voja_rate": 0.0, "pes_rate": 2.5e-4},
+    "binding": "exact",
+    "vector_neurons": 0,
+}
+
+METHODS: dict[str, dict[str, Any]] = {
+    "RatSLAM": {"cells": "pose"},
+    "competitive Hebb": {"cells": "place", "wall_memory": {"corrects": False}},
+    "SLRB": {"cells": "place"},
+    "SSP-SLAM, vectors": {"cells": "semantic"},
+    "SSP-SLAM, rates": {"cells": "semantic", "semantic": {"tier": "rate", **_NEURONS}},
+    "SSP-SLAM, spikes": {"cells": "semantic", "semantic": {"tier": "spiking", **_NEURONS}},
+    "RatSLAM and SLRB": {"cells": "pose+place"},
+    "full": {},
+}
+"""Name -> what differs from the preset ``full``."""
+
+LOSSES = {
+    "nothing is lost": "",
+    "camera dark for 60 s": "dark=70-130",
+    "ranges gone for 60 s": "blind=70-130",
+    "carried half a lap": "carried=100:0.5",
+}
+_TESTED = ("RatSLAM", "SLRB", "SSP-SLAM, vectors", "full")
+
+
+class Life(NamedTuple):
+    """What a brain made of a drive.
+
+    Attributes:
+        error_m: Of each frame, on the final map laid rigidly over the truth.
+        places: Experiences of its map.
+        bytes: Of its state.
+        cpu_ms: Of one thread, a frame.
+    """
+
+    error_m: np.ndarray
+    places: int
+    bytes: int
+    cpu_ms: float
+
+    @property
+    def ate_m(self) -> float:
+        """Absolute trajectory error, RMS."""
+        return float(np.sqrt(np.mean(self.error_m**2)))
+
+
+def compare(
+    _data_folder: Path | None,
+    out_folder: Path,
+    worlds: Sequence[str] = WORLDS,
+    seeds: Sequence[int] = (0, 1, 2),
+    laps: float = 4.0,
+    methods: Sequence[str] = tuple(METHODS),
+    losses: Sequence[str] = tuple(LOSSES),
+) -> dict[str, Any]:
+    """Compare all methods in rendered worlds, and what is left of each when a sense is lost.
+
+    Args:
+        _data_folder: It needs none.
+        out_folder: ``results.json``, ``comparison.png`` and ``losses.png`` are written there.
+        worlds: Names of rendered worlds.
+        seeds: Of the noise; one drive for each.
+        laps: Of each drive; drives that lose a sense are six laps of the first world.
+        methods: Of ``METHODS``.
+        losses: Of ``LOSSES``.
+
+    Returns:
+        The content of ``results.json``: ``rows``, one for each world and method, and ``losses``.
+    """
+    out = Path(out_folder)
+    rows: list[dict[str, Any]] = []
+    for world in worlds:
+        lives: dict[str, list[Life]] = {name: [] for name in methods}
+        alone = []
+        for seed in seeds:
+            frames = list(open_source(f"world:{world}?{SENSES}&laps={laps:g}&seed={seed}"))
+            alone.append(_rms(_off(_reckoned(frames), frames)))
+            for name in methods:
+                lives[name].append(live(config_of(name), frames))
+        rows.append(_row(world, "odometry alone", alone))
+        rows += [
+            _row(
+                world, name, [life.ate_m for life in each],
+                places=round(np.mean([life.places for life in each])),
+                kilobytes=round(np.mean([life.bytes for life in each]) / 1000.0),
+                cpu_ms=float(np.median([life.cpu_ms for life in each])),
+            )
+            for name, each in lives.items()
+        ]  # fmt: skip
+    told, curves = _lose(worlds[0], seeds[0], losses, [m for m in _TESTED if m in methods])
+    save(plot_comparison(rows), out / "comparison.png")
+    if curves:
+        save(plot_losses(curves, {name: LOSSES[name] for name in curves}), out / "losses.png")
+    results = {"rows": rows, "losses": told}
+    write_results(out, results)
+    return results
+
+
+def config_of(method: str) -> BrainConfig:
+    """Return the config of a method: the preset ``full``, and what differs."""
+    return build_config(merge_values(read_preset("full"), METHODS[method]), method)
+
+
+def live(config: BrainConfig, frames: Sequence[Frame]) -> Life:
+    """Let a brain take in a drive; the time is that of the brain alone."""
+    brain, at, cpu_s = NavigationBrain(config), [], 0.0
+    with one_thread(1), torch.inference_mode():
+        for frame in frames:
+            begin = time.process_time()
+            brain(frame)
+            cpu_s += time.process_time() - begin
+            at.append((brain.map.current, brain.map.offset))
+    track = np.array([brain.place(experience, offset) for experience, offset in at])
+    size = sum(value.numel() * value.element_size() for value in brain.state_dict().values())
+    first = next(k for k, (experience, _) in enumerate(at) if experience != NO_EXPERIENCE)
+    off = np.zeros(len(frames))
+    off[first:] = _off(track[first:], frames[first:])
+    return Life(off, brain.map.n, size, 1000.0 * cpu_s / len(frames))
+
+
+def _off(track: np.ndarray, frames: Sequence[Frame]) -> np.ndarray:
+    truth = np.array([frame.truth[:2] for frame in frames])
+    moved = align(track[:, :2], truth, "rigid").apply(track[:, :2])
+    return np.linalg.norm(moved - truth, axis=1)
+
+
+def _reckoned(frames: Sequence[Frame]) -> np.ndarray:
+    times = np.array([frame.time_s for frame in frames])
+    v, w = np.array([frame.velocity for frame in frames]).T
+    return integrate_velocities(v, w, np.diff(times, prepend=times[0]), Pose(0.0, 0.0, 0.0))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _row(world: str, method: str, ates: list[float], **more: float) -> dict[str, Any]:
+    return {
+        "world": world,
+        "method": method,
+        "ate_m": float(np.mean(ates)),
+        "ate_std_m": float(np.std(ates)),
+        "ate_each_m": ates,
+        **more,
+    }
+
+
+def _lose(
+    world: str, seed: int, losses: Sequence[str], methods: Sequence[str]
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, np.ndarray]]]:
+    """Drive six laps without a sense for a while: the error over time, and in the last lap."""
+    rows, curves = [], {}
+    for loss in losses:
+        source = open_source(f"world:{world}?{SENSES}&laps=6&seed={seed}&{LOSSES[loss]}")
+        frames, lap = list(source), source.frames_per_lap
+        curves[loss] = {}
+        for method in methods:
+            life = live(config_of(method), frames)
+            curves[loss][method] = life.error_m
+            rows.append(
+                {
+                    "loss": loss,
+                    "method": method,
+                    "ate_m": life.ate_m,
+                    "largest_error_m": float(life.error_m.max()),
+                    "ate_last_lap_m": _rms(life.error_m[-lap:]),
+                }
+            )
+    return rows, curves
