@@ -33,24 +33,35 @@ def bounds(metadata: list[object]) -> str:
     return ", ".join(found)
 
 
+def is_section(annotation: object) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def tables(section: type[BaseModel], path: str) -> list[str]:
+    """A table of a section's own parameters, then those of the sections within it."""
+    classic = {ours: theirs for theirs, ours in CLASSIC_NAMES.items()}
+    rows, inner = [], []
+    for key, each in section.model_fields.items():
+        if is_section(each.annotation):
+            inner += tables(each.annotation, f"{path}.{key}")
+            continue
+        default = "none" if each.default is None else each.default
+        rows.append(
+            f"| `{key}` | {default} | {bounds(each.metadata)} | {each.description or ''} | "
+            f"{'`' + classic[path, key] + '`' if (path, key) in classic else ''} |"
+        )
+    return [f"\n## `[{path}]`\n{section.__doc__.splitlines()[0]}\n\n{COLUMNS}", *rows, *inner]
+
+
 def page() -> str:
     """The whole page."""
-    classic = {ours: theirs for theirs, ours in CLASSIC_NAMES.items()}
-    parts = [HEAD]
-    general = []
+    parts, general = [HEAD], []
     for name, field in BrainConfig.model_fields.items():
-        if not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+        if is_section(field.annotation):
+            parts += tables(field.annotation, name)
+        else:
             general.append(
                 f"| `{name}` | {field.default} | {bounds(field.metadata)} | {field.description} | |"
-            )
-            continue
-        about = field.annotation.__doc__.splitlines()[0]
-        parts.append(f"\n## `[{name}]`\n{about}\n\n{COLUMNS}")
-        for key, each in field.annotation.model_fields.items():
-            default = "none" if each.default is None else each.default
-            parts.append(
-                f"| `{key}` | {default} | {bounds(each.metadata)} | {each.description or ''} | "
-                f"{'`' + classic[name, key] + '`' if (name, key) in classic else ''} |"
             )
     parts.append(f"\n## Besides\n\n{COLUMNS}")
     return "\n".join(parts + general) + "\n"

@@ -313,7 +313,7 @@ def _across(rows: list[dict[str, Any]], title: str) -> Iterator[Table]:
 def _shown(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if value == value else ""  # NaN is not equal to itself
-    text = "; ".join(value) if isinstance(value, list) else str(value)
+    text = "; ".join(map(_shown, value)) if isinstance(value, list) else str(value)
     return text.replace("_", " ")
 
 

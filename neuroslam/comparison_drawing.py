@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from neuroslam.drawing import CURVES, INK, MAP, ODOMETRY, ROBOT, STYLE, legend_below, new_figure
 
@@ -40,8 +41,7 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                     f"{row['ate_m']:.2f}", (max(row["ate_each_m"]), k), xytext=(6, 0),
                     textcoords="offset points", va="center", fontsize=8,
                 )  # fmt: skip
-            ax.set_xscale("log")
-            ax.set_xlim(right=ax.get_xlim()[1] * 1.6)
+            _logarithmic(ax)
             ax.set_xlabel("absolute trajectory error (m)")
             ax.set_title(world)
         cost = axes[-1]
@@ -53,13 +53,22 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                     f"{np.mean(each):.2g}", (np.mean(each), k), xytext=(4, 0),
                     textcoords="offset points", va="center", fontsize=8,
                 )  # fmt: skip
-        cost.set_xscale("log")
-        cost.set_xlim(right=cost.get_xlim()[1] * 1.6)
+        _logarithmic(cost)
         cost.set_xlabel("CPU time of a frame (ms)")
         cost.set_title("cost")
         axes[0].set_yticks(range(len(methods)), methods)
         figure.supxlabel("bars: mean over drives; circles: each drive", fontsize=8)
     return figure
+
+
+def _logarithmic(ax: mpl.axes.Axes) -> None:
+    """Write few and plain numbers on a logarithmic axis, and leave room for labels of bars."""
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    ax.set_xlim(low / 1.2, high * 1.7)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 def plot_losses(

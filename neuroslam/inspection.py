@@ -25,6 +25,7 @@ from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links, closes_loop
 from neuroslam.population import State
 from neuroslam.run_files import (
+    LANDMARKS_FILE,
     brain_file,
     experiences_csv,
     landmarks_csv,
@@ -375,7 +376,7 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "links.csv": links_csv(brain.map.links),
     }
     if brain.config.has("semantic"):
-        expected["landmarks.csv"] = landmarks_csv(brain)
+        expected[LANDMARKS_FILE] = landmarks_csv(brain)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:

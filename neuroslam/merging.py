@@ -13,6 +13,7 @@ from neuroslam.brain.merge import MergeReport, merge
 from neuroslam.errors import RunError
 from neuroslam.run_files import (
     FRAME_COLUMNS,
+    LANDMARKS_FILE,
     RUN_FILES,
     RunPlan,
     brain_file,
@@ -159,7 +160,7 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
                     (beside / file).write_text(empty)
             summary = write_results(brain, plan, beside, RunSummary())
             out.mkdir(exist_ok=True)
-            for file in ("brain.safetensors", *RUN_FILES):
+            for file in ("brain.safetensors", *RUN_FILES, LANDMARKS_FILE):
                 if (beside / file).exists():
                     (beside / file).replace(out / file)
     except OSError as error:

@@ -34,8 +34,10 @@ TRACE_COLUMNS = (
 
 RUN_FILES = (
     "frames.csv", "trace.f64", "config.toml", "metrics.json", "brain.safetensors",
-    "experiences.csv", "links.csv", "landmarks.csv", "trajectory.tum", "map.png",
+    "experiences.csv", "links.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
+LANDMARKS_FILE = "landmarks.csv"
+"""Besides, where the brain has a semantic map."""
 
 
 OnBadFrame = Literal["skip", "stop"]
@@ -106,7 +108,7 @@ class RowWriter:
             out.mkdir(parents=True, exist_ok=True)
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
                 shutil.rmtree(out / "events", ignore_errors=True)
-                for name in RUN_FILES[2:]:  # none would fit the new rows
+                for name in (*RUN_FILES[2:], LANDMARKS_FILE):  # none would fit the new rows
                     (out / name).unlink(missing_ok=True)
                 frames.write(FRAME_COLUMNS + "\n")
                 yield cls(frames, trace)

@@ -32,6 +32,7 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.review import draw_map
 from neuroslam.run_files import (
+    LANDMARKS_FILE,
     OnBadFrame,
     RowWriter,
     RunPlan,
@@ -385,7 +386,7 @@ def write_results(
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
         if brain.config.has("semantic"):
-            write_text(out / "landmarks.csv", landmarks_csv(brain))
+            write_text(out / LANDMARKS_FILE, landmarks_csv(brain))
         write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
         draw_map(brain, plan, trace, out / "map.png")
     except OSError as error:

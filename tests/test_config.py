@@ -140,10 +140,16 @@ def test_the_page_of_parameters_is_up_to_date():
     assert (docs / "parameters.md").read_text() == module.page(), "run: python docs/parameters.py"
 
 
-def test_every_parameter_says_what_it_does():
-    for name, field in BrainConfig.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            for key, each in field.annotation.model_fields.items():
-                assert each.description, f"{name}.{key}"
+def described(section, path=""):
+    for key, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            assert inner.__doc__, f"{path}{key}"
+            yield from described(inner, f"{path}{key}.")
         else:
-            assert field.description, name
+            assert field.description, f"{path}{key}"
+            yield f"{path}{key}"
+
+
+def test_every_parameter_says_what_it_does():
+    assert "semantic.space.reach_m" in set(described(BrainConfig))

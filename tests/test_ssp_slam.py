@@ -337,7 +337,10 @@ WRONG = {
     "position of shape": lambda s, _: s.start(torch.zeros(2, 2)),
     "places = true": lambda s, _: queries.what(s, (0, 0), (1, 1)),
     "55 features": lambda s, _: queries.recall(s, torch.zeros(3)),
-    r"\(landmarks, 55\)": lambda s, _: SSPSLAM(s.config, torch.zeros(3, 5)),
+    r"\(landmarks, features\)": lambda s, _: SSPSLAM(s.config, torch.zeros(3)),
+    "as many features as the space": lambda s, _: queries.whole_map(
+        SSPSLAM(s.config, torch.eye(3, 5))
+    ),
     "2 names for 3": lambda s, _: SSPSLAM(s.config, s.pointers, ["A", "B"]),
 }
 

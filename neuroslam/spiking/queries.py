@@ -202,7 +202,15 @@ def whole_map(slam: SSPSLAM, animal: int = 0) -> Tensor:
 
     Returns:
         ``(n_features,)``; unbind a pointer from it and it is where that landmark is.
+
+    Raises:
+        SpaceError: If pointers are of another length than places, so that they cannot be bound.
     """
+    if slam.pointers.shape[1] != slam.space.n_features:
+        raise SpaceError(
+            f"whole_map: pointers of {slam.pointers.shape[1]} features; to be bound with places "
+            f"they need as many features as the space, {slam.space.n_features}"
+        )
     places = torch.fft.rfft(slam.map.read(slam.pointers)[animal])
     pointers = torch.fft.rfft(slam.pointers)
     return torch.fft.irfft((places * pointers).sum(0), n=slam.space.n_features)
