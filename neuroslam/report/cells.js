@@ -3,14 +3,15 @@
 
 const TRAIL_S = 20;
 
-function makePanel(title, note, paint, aspect) {
+function makePanel(title, note, paint, aspect, box = null) {
   const canvas = make("canvas", { role: "img", "aria-label": `${title}. ${note}` });
   const panel = {
-    width: 0,
+    width: 0, seen: false,
     resize() {
       const width = canvas.clientWidth;
       if (width && width !== this.width) { this.width = width; this.paint(); }
     },
+    follow() { if (this.seen) this.paint(); },
     paint() {
       if (!this.width) return;
       const height = this.width * aspect;
@@ -18,8 +19,10 @@ function makePanel(title, note, paint, aspect) {
       paint(fitCanvas(canvas, this.width, height), this.width, height);
     },
   };
-  $("cell-panels").append(make("div", { class: "card" }, make("h3", { text: title }), make("p", { text: note }), canvas));
+  if (box) box.append(make("h3", { text: title }), canvas);
+  else $("cell-panels").append(make("div", { class: "card" }, make("h3", { text: title }), make("p", { text: note }), canvas));
   new ResizeObserver(() => panel.resize()).observe(canvas);
+  new IntersectionObserver(([entry]) => { panel.seen = entry.isIntersecting; panel.follow(); }).observe(canvas);
   watch("colours", () => panel.paint());
   return panel;
 }
@@ -57,9 +60,14 @@ function paintTorus(pen, width, height) {
   pen.beginPath();
   for (let i = 1; i < n; i++) { pen.moveTo(x(i), y(0)); pen.lineTo(x(i), y(n)); pen.moveTo(x(0), y(i)); pen.lineTo(x(n), y(i)); }
   pen.stroke();
+  pen.fillStyle = colours.link;
+  const size = known.places > 1500 ? 1.4 : 2.4;
+  for (let i = 0; i < known.places; i++) {
+    pen.fillRect(x(run.place_cell[3 * i]) - size / 2, y(run.place_cell[3 * i + 1]) - size / 2, size, size);
+  }
   const end = chosen.row, first = rowOfTime(run.row_time_s[end] - TRAIL_S);
   pen.lineWidth = 2.5;
-  pen.lineCap = "round";
+  pen.lineCap = "butt";
   pen.strokeStyle = colours.path;
   for (let i = first + 1, step = Math.max(1, (end - first) >> 9); i <= end; i += step) {
     const from = Math.max(first, i - step);
@@ -75,13 +83,13 @@ function paintTorus(pen, width, height) {
   dart(pen, x(run.row_pose_x[end]), y(run.row_pose_y[end]), (2 * Math.PI * run.row_pose_theta[end]) / nTheta, colours.robot);
 }
 
-function heat(pen, box, values, rows, columns) {
+function heat(pen, box, values, rows, columns, most = 0) {
   const image = document.createElement("canvas");
   image.width = columns;
   image.height = rows;
   const ink = image.getContext("2d"), pixels = ink.createImageData(columns, rows);
-  let top = 0;
-  for (const value of values) top = Math.max(top, value);
+  let top = most;
+  if (!most) for (const value of values) top = Math.max(top, value);
   for (let r = 0; r < rows; r++) {
     for (let c = 0; c < columns; c++) {
       pixels.data.set([...ramp(values[r * columns + c] / (top || 1)), 255], 4 * ((rows - 1 - r) * columns + c));
@@ -93,15 +101,25 @@ function heat(pen, box, values, rows, columns) {
   return top;
 }
 
-function paintActivity(pen, width, height) {
-  const [n, nTheta] = about.torus, half = width / 2;
+function paintActivity(pen, width, whole) {
+  const height = whole - 30, [n, nTheta] = about.torus, half = width / 2;
   const place = axes(pen, half, height, [0, n], [0, n], "x (cells)", "y (cells)");
-  heat(pen, { x0: place.x(0), x1: place.x(n), y0: place.y(n), y1: place.y(0) }, run.activity_xy, n, n);
+  const most = heat(pen, { x0: place.x(0), x1: place.x(n), y0: place.y(n), y1: place.y(0) }, run.activity_xy, n, n);
   pen.save();
   pen.translate(half, 0);
   const heading = axes(pen, half, height, [0, n], [0, 360], "x (cells)", "heading θ (°)");
-  heat(pen, { x0: heading.x(0), x1: heading.x(n), y0: heading.y(360), y1: heading.y(0) }, run.activity_theta_x, nTheta, n);
+  heat(pen, { x0: heading.x(0), x1: heading.x(n), y0: heading.y(360), y1: heading.y(0) }, run.activity_theta_x, nTheta, n, most);
   pen.restore();
+  const bar = pen.createLinearGradient(60, 0, 220, 0);
+  RAMP.forEach((rgb, i) => bar.addColorStop(i / (RAMP.length - 1), `rgb(${rgb})`));
+  pen.fillStyle = bar;
+  pen.fillRect(60, whole - 20, 160, 9);
+  pen.fillStyle = colours.soft;
+  pen.textBaseline = "middle";
+  pen.textAlign = "right";
+  pen.fillText("0", 54, whole - 15);
+  pen.textAlign = "left";
+  pen.fillText(`${most.toFixed(3)} of all activity`, 226, whole - 15);
 }
 
 function paintPlaceCells(pen, width, height) {
@@ -142,10 +160,11 @@ function paintPlaceCells(pen, width, height) {
 function startCells() {
   if (about.cells !== "place") {
     if (known.rows) {
-      const torus = makePanel("Packet of the pose cells", `Its path over the torus in the last ${TRAIL_S} s up to the frame; the arrow is its heading. Edges meet.`, paintTorus, 1);
-      watch("row", () => torus.paint());
+      const note = `Its path over the torus in the last ${TRAIL_S} s up to the frame; the arrow is its heading. Edges meet. Dots: where places are bound.`;
+      const panels = [makePanel("Packet of the pose cells", note, paintTorus, 0.95), makePanel("Pose cells, the last " + TRAIL_S + " s", note, paintTorus, 0.95, $("now-cells"))];
+      watch("row", () => panels.forEach((panel) => panel.follow()));
     }
-    makePanel("Activity at the end of the run", "Left summed over heading, right over y; yellow is most. A run keeps the activity of its end only.", paintActivity, 0.56);
+    makePanel("Activity at the end of the run", "Left summed over heading, right over y; yellow is most. A run keeps the activity of its end only.", paintActivity, 0.62);
   }
   if (about.cells !== "pose") {
     const cells = run.cell_x_m.length, walls = run.wall_x_m.length;

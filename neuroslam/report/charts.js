@@ -9,7 +9,7 @@ function timeSpan() {
 }
 
 // One chart: series of { name, colour, value(row), dots, of(row) } with rows in `at` or all of them.
-function makeChart(title, unit, height, series, { low = null, high = null, limit = null, digits = 2 } = {}) {
+function makeChart(title, unit, height, series, { low = null, high = null, limit = null, digits = 2, step = null } = {}) {
   const told = series.map((one) => make("b", { text: "" }));
   const head = make("div", { class: "head" }, make("h3", { text: title }), unit ? make("span", { text: unit }) : null,
     ...series.map((one, i) => {
@@ -57,7 +57,7 @@ function makeChart(title, unit, height, series, { low = null, high = null, limit
       const [t0, t1] = timeSpan();
       this.x = (time) => CHART.left + ((time - t0) / (t1 - t0)) * (this.width - CHART.left - CHART.right);
       this.y = (value) => CHART.top + ((top - value) / (top - bottom)) * inner;
-      const up = niceTicks(bottom, top, inner / 30), across = niceTicks(0, t1 - t0, this.width / 110);
+      const up = step ? { ticks: [0, 1, 2, 3, 4].map((i) => i * step), digits: 0 } : niceTicks(bottom, top, inner / 30), across = niceTicks(0, t1 - t0, this.width / 110);
       pen.fillStyle = colours.lost;
       for (const [a, b] of about.lost) pen.fillRect(this.x(run.row_time_s[a]), CHART.top, Math.max(1.5, this.x(run.row_time_s[b]) - this.x(run.row_time_s[a])), inner);
       pen.strokeStyle = colours.faint;
@@ -190,10 +190,10 @@ function startCharts() {
     ], { low: 0, high: nXY });
     add("Heading of the packet", "degrees", 90, [
       { name: "θ", around: 360, digits: 0, colour: () => colours.path, value: (i) => (360 * run.row_pose_theta[i]) / nTheta },
-    ], { low: 0, high: 360 });
+    ], { low: 0, high: 360, step: 90 });
   }
   const curve = (name, title, unit, colour, settings) => {
-    if (run[`${name}_row`]) add(title, unit, 80, [{ name: "", at: run[`${name}_row`], digits: 3, colour, value: column(`${name}_value`) }], settings);
+    if (run[`${name}_row`] && (name === "doubt_s" || run[`${name}_value`].some((value) => value))) add(title, unit, 80, [{ name: "", at: run[`${name}_row`], digits: 3, colour, value: column(`${name}_value`) }], settings);
   };
   curve("doubt_s", "Doubt about the place", "seconds; while walls contradict the map it grows", () => colours.match, { low: 0 });
   curve("peak", "Largest activity of a pose cell", "share of all activity", () => colours.path, { low: 0 });

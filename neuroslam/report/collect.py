@@ -77,6 +77,7 @@ def collect(run: FinishedRun) -> Facts:
         "config": config_rows(run.brain.config),
         "range": {"start": run.plan.start, "stop": run.plan.stop,
                   "on_bad_frame": run.plan.on_bad_frame},
+        "truth_scale": truth_on_map(trajectory(run.brain, run.trace), true_poses(run.trace))[1],
         "lost": [_within(rows, span) for span in lost_spans(run)],
         "notes": notes,
     }  # fmt: skip
@@ -112,7 +113,7 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
     frames, trace, brain = run.frames, run.trace, run.brain
     place = places_of(brain, trace)[0]
     track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
-    truth = _truth_on_map(track, true_poses(trace))
+    truth = truth_on_map(track, true_poses(trace))[0]
     whole = {
         "frame": frames["frame"].astype(np.int32),
         "time_s": frames["time_s"],
@@ -132,15 +133,23 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
     return {f"row_{name}": column[rows] for name, column in whole.items()}
 
 
-def _truth_on_map(track: np.ndarray, truth: np.ndarray | None) -> np.ndarray | None:
-    """Lay the true track over the map, rigidly, as the error in metrics.json does."""
+def truth_on_map(
+    track: np.ndarray, truth: np.ndarray | None
+) -> tuple[np.ndarray | None, float | None]:
+    """Lay the true track over the map, as ``map.png`` lays the map over the truth.
+
+    Returns:
+        Positions ``(frames, 2)`` in metres of the map, and metres of the truth in one of them;
+        ``None`` where there is no truth, or nothing tells how it lies.
+    """
     on_map = np.isfinite(track[:, 0])
     if truth is None or not on_map.any():
-        return None
+        return None, None
     try:
-        return align(track[on_map, :2], truth[on_map, :2], "rigid").undo(truth[:, :2])
-    except MapError:  # the robot stood still, or went straight: nothing tells how it lies
-        return None
+        motion = align(track[on_map, :2], truth[on_map, :2], "similarity")
+    except MapError:  # the robot stood still, or went straight
+        return None, None
+    return motion.undo(truth[:, :2]), motion.scale
 
 
 def _map(run: FinishedRun) -> dict[str, np.ndarray]:
@@ -152,6 +161,7 @@ def _map(run: FinishedRun) -> dict[str, np.ndarray]:
         "place_x_m": poses[:, 0],
         "place_y_m": poses[:, 1],
         "place_theta_rad": poses[:, 2],
+        "place_cell": table["cell"],
         "place_template": table["template"].astype(np.int32),
         "place_first_frame": table["first_frame"].astype(np.int32),
         "place_session": np.array([known.get(s, 0) for s in table["session"].tolist()], np.int32),
@@ -301,16 +311,14 @@ def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
 
     Example:
         >>> metric_rows({"frames": 3, "seconds": 1.5, "skipped": [], "ate_rmse_m": 0.2})
-        [['frames', 3, ''], ['seconds', 1.5, 's'], ['ate rmse', 0.2, 'm']]
+        [['frames', 3, ''], ['seconds', 1.5, ''], ['ate rmse', 0.2, 'm']]
     """
     rows = []
     for key, value in metrics.items():
         if isinstance(value, list | dict):
             continue
         name, unit = key, ""
-        if "frames_per" in key or key.endswith("seconds"):
-            unit = "s" if key.endswith("seconds") else "frames/s"
-        elif key.endswith(("_m", "_s")):
+        if key.endswith(("_m", "_s")) and "_per_" not in key:
             name, _, unit = key.rpartition("_")
         finite = not isinstance(value, float) or math.isfinite(value)
         rows.append([name.replace("_", " "), value if finite else str(value), unit])

@@ -47,6 +47,7 @@ const map = {
     }
     lengths.sort((a, b) => a - b);
     this.spacing = lengths[lengths.length >> 1] || 0.2;
+    this.leastDot = Math.max(1.3, Math.min(3, 40 / Math.sqrt(known.places || 1)));
   },
   resize() {
     const box = this.canvas.parentElement.getBoundingClientRect();
@@ -73,7 +74,7 @@ const map = {
   sy(y) { return (this.view.y - y) * this.view.scale + this.height / 2; },
   wx(sx) { return (sx - this.width / 2) / this.view.scale + this.view.x; },
   wy(sy) { return this.view.y - (sy - this.height / 2) / this.view.scale; },
-  get dot() { return Math.max(1.3, Math.min(6, 0.24 * this.spacing * this.view.scale)); },
+  get dot() { return Math.max(this.leastDot, Math.min(6, 0.24 * this.spacing * this.view.scale)); },
 
   fit() {
     let [x0, x1, y0, y1] = [Infinity, -Infinity, Infinity, -Infinity];
@@ -209,16 +210,15 @@ function paintStill(pen, at, dot) {
   if (layers.links.on) drawLinks(pen, at, colours.link, 1, (i) => !run.link_loop[i]);
   pen.globalAlpha = 0.3;
   drawPlaces(pen, at, dot, known.byFirstRow);
-  pen.globalAlpha = 1;
   if (layers.loops.on) {
     pen.globalAlpha = 0.35;
-    drawLinks(pen, at, colours.loop, 1.2, (i) => run.link_loop[i] && known.linkRow[i] >= 0);
-    pen.globalAlpha = 1;
-    drawLinks(pen, at, colours.loop, 1.4, (i) => run.link_loop[i] && known.linkRow[i] < 0);
+    drawLoops(pen, at, dot, (i) => known.linkRow[i] >= 0);
   }
+  pen.globalAlpha = 1;
   const before = [];  // places of earlier sessions where this run never came
   for (let i = 0; i < known.places; i++) if (known.firstRow[i] < 0) before.push(i);
   drawPlaces(pen, at, dot, before);
+  if (layers.loops.on) drawLoops(pen, at, dot, (i) => known.linkRow[i] < 0);
 }
 
 function paintProgress(pen, at, dot) { paintProgressOn(pen, at, dot, -1); }
@@ -228,11 +228,8 @@ function paintProgressOn(pen, at, dot, from) {
   pen.lineJoin = pen.lineCap = "round";
   if (layers.track.on && known.rows) {
     pen.strokeStyle = colours.path;
-    pen.lineWidth = 2;
+    pen.lineWidth = dot < 2 ? 1.2 : 2;
     line(pen, at, run.row_x_m, run.row_y_m, Math.max(0, from), row);
-  }
-  if (layers.loops.on) {
-    drawLinks(pen, at, colours.loop, 1.6, (i) => run.link_loop[i] && known.linkRow[i] > from && known.linkRow[i] <= row);
   }
   const places = known.byFirstRow, ofRow = (place) => known.firstRow[place];
   let first = from < 0 ? 0 : lastNotAbove(places, from, ofRow);
@@ -240,6 +237,7 @@ function paintProgressOn(pen, at, dot, from) {
   let end = first;
   while (end < places.length && ofRow(places[end]) <= row) end++;
   drawPlaces(pen, at, dot, places.slice(first, end));
+  if (layers.loops.on) drawLoops(pen, at, dot, (i) => known.linkRow[i] > from && known.linkRow[i] <= row);
 }
 
 function drawLinks(pen, at, colour, width, wanted) {
@@ -251,6 +249,21 @@ function drawLinks(pen, at, colour, width, wanted) {
     const a = run.link_from[i], b = run.link_to[i];
     pen.moveTo(at.sx(run.place_x_m[a]), at.sy(run.place_y_m[a]));
     pen.lineTo(at.sx(run.place_x_m[b]), at.sy(run.place_y_m[b]));
+  }
+  pen.stroke();
+}
+
+// Loop closures are often as short as any link: a ring marks the place that was come back to.
+function drawLoops(pen, at, dot, wanted) {
+  drawLinks(pen, at, colours.loop, 1.6, (i) => run.link_loop[i] && wanted(i));
+  const radius = Math.max(dot + 2.2, 3.2);
+  pen.lineWidth = 1.3;
+  pen.beginPath();
+  for (const link of known.loops) {
+    if (!wanted(link)) continue;
+    const x = at.sx(run.place_x_m[run.link_to[link]]), y = at.sy(run.place_y_m[run.link_to[link]]);
+    pen.moveTo(x + radius, y);
+    pen.arc(x, y, radius, 0, 7);
   }
   pen.stroke();
 }
@@ -373,6 +386,13 @@ function drawLive(pen, at) {
     pen.strokeStyle = colours.ink;
     pen.lineWidth = 1.6;
     pen.stroke();
+  }
+  if (layers.track.on) {  // on a second lap the path so far hides where the robot just came from
+    pen.strokeStyle = colours.path;
+    pen.lineWidth = 3.5;
+    pen.lineJoin = pen.lineCap = "round";
+    const seconds = Math.max(5, 0.02 * (run.row_time_s[known.rows - 1] - run.row_time_s[0]));
+    line(pen, at, run.row_x_m, run.row_y_m, rowOfTime(run.row_time_s[chosen.row] - seconds), chosen.row);
   }
   const here = run.row_place[chosen.row];
   if (here >= 0) ring(pen, px(here), py(here), dot + 3, colours.robot, 2);

@@ -81,7 +81,7 @@ const SAID = {
 };
 
 function showNow() {
-  const panel = $("now"), row = chosen.row;
+  const panel = $("now-facts"), row = chosen.row;
   if (!known.rows) {
     panel.replaceChildren(make("p", { class: "soft", text: "This map was merged from brain files alone: it has no frames." }));
     return;
@@ -98,7 +98,7 @@ function showNow() {
     ? `${run.row_x_m[row].toFixed(2)} m, ${run.row_y_m[row].toFixed(2)} m, ${degrees(run.row_theta_rad[row])}`
     : "on a map that was not joined";
   panel.replaceChildren(
-    make("span", { class: `act ${lost ? "lost" : action}`, text: lost ? "lost: walls contradict the map" : SAID[action] }),
+    make("span", { class: `act ${lost ? "lost" : action}`, text: lost ? "lost: walls contradict the map" : place < 0 ? "at no place of this map" : SAID[action] }),
     hasViews || taken
       ? make("div", { class: "pair" },
         picture(taken?.source, caption, `What the robot saw in ${caption}`),
@@ -106,7 +106,7 @@ function showNow() {
       : "",
     facts([
       ["frame", `${frame}, ${duration(run.row_time_s[row] - run.row_time_s[0])} after the start`],
-      ["place", place >= 0 ? placeButton(place) : "none yet"],
+      ["place", place >= 0 ? placeButton(place) : "none"],
       ["position", at],
       ["motion", `${run.row_v_m_s[row].toFixed(2)} m/s, ${degrees(run.row_w_rad_s[row])}/s`],
       ["match error", hasViews ? matchMeter(error) : null],

@@ -116,7 +116,7 @@ def _from_source(
     """Take the pictures of these frames; and say what is missing, or nothing."""
     name = RunPlan(spec).name
     found: dict[int, bytes] = {}
-    seen = 0
+    seen, fault = 0, ""
     try:
         for frame in _frames(open_source(spec, frame_rate_hz), numbers):
             seen += 1
@@ -125,13 +125,14 @@ def _from_source(
             elif not found and seen >= _BLIND_AFTER:
                 break
     except SourceError:
-        return found, f"No pictures of {name}: it cannot be opened any more, or not be read to " + (
-            "its end."
-        )
+        fault = "it cannot be read to its end" if seen else "it cannot be opened any more"
     if seen and not found:
-        return found, f"No pictures of {name}: it has no camera."
+        fault = fault or "it has no camera"
+    if not found:
+        return found, f"No pictures of {name}: {fault or 'its frames are not there any more'}."
     missing = len(numbers) - len(found)
-    return found, f"{missing:,} frames of {name} have no picture any more." if missing else ""
+    why = f": {fault}" if fault else ""
+    return found, f"{missing:,} frames of {name} have no picture any more{why}." if missing else ""
 
 
 def _frames(source: Source, numbers: list[int]) -> Iterator[Frame]:

@@ -200,6 +200,7 @@ async function start() {
   if (known.rows) showClock();
   showNow();
   showPlace();
+  if (!known.rows) showTab("place");
   paintStrip();
   document.documentElement.dataset.ready = "yes";
 }

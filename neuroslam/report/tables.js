@@ -103,7 +103,7 @@ function startNotes() {
   const notes = [
     "Places, links and the path are those of the final map: a frame keeps its offset from its place, so the path moves with the map.",
     "The path grows with the slider; places fill in when the robot first comes to them. A loop closure is a link between places that were both known.",
-    ...(run.row_truth_x_m ? ["The truth is laid over the path rigidly, as for the error in the figures."] : []),
+    ...(run.row_truth_x_m ? [`The truth is turned, shifted and scaled to lie over the path: one metre of the map is ${figure(about.truth_scale)} m. The errors among the figures are without scaling.`] : []),
     ...about.notes, ...about.picture_notes,
     pictures.length ? `${many(pictures.length, "picture")} of frames are in this page; the frame shown is the nearest one before the slider that has a picture.` : "No pictures of frames are in this page.",
     "The page is one file and asks nothing of the network.",
@@ -138,7 +138,7 @@ function showLegend() {
   if (layers.loops.on) add("key-line", colour(colours.loop), "loop closures");
   if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
   if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
-  if (layers.truth.on) add("key-line dashed", colour(colours.truth), "truth");
+  if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, the map scaled by ${about.truth_scale.toFixed(2)}`);
   if (layers.merges.on) add("key-ring", colour(colours.match), "maps joined here");
   if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "walls as remembered");
   $("legend").replaceChildren(...items);
