@@ -259,9 +259,7 @@ def plot_command(
 
 @app.command("report")
 def report_command(
-    out: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `run` or `merge` wrote.")
-    ],
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `merge` wrote.")],
     to: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write; DIR/report.html.")
     ] = None,

@@ -17,8 +17,10 @@ from neuroslam.report.pictures import Pictures, take_pictures
 from neuroslam.report.reading import read_run
 from neuroslam.run_files import RUN_FILES, write_text
 
-SCRIPTS = ("data.js", "view.js", "map.js", "charts.js", "cells.js", "panels.js", "tables.js",
-           "player.js")  # fmt: skip
+SCRIPTS = (
+    "data.js", "view.js", "map.js", "marks.js", "charts.js", "cells.js", "panels.js", "tables.js",
+    "player.js",
+)  # fmt: skip
 """Scripts of the page, in the order in which they need each other."""
 
 PICTURES_MB = 12.0
@@ -102,9 +104,9 @@ def pack(arrays: dict[str, np.ndarray]) -> tuple[dict[str, Any], str]:
         For each array its type, shape and first byte; and the text.
 
     Example:
-        >>> index, text = pack({"x": np.arange(3, dtype=np.int32)})
+        >>> index, text = pack({"x": np.arange(4, dtype=np.int32)})
         >>> index, np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i4").tolist()
-        ({'x': ['<i4', [3], 0]}, [0, 1, 2])
+        ({'x': ['<i4', [4], 0]}, [0, 1, 2, 3])
     """
     index, chunks, at = {}, [], 0
     for name, array in arrays.items():

@@ -127,6 +127,7 @@ function matchMeter(error) {
 
 function showPlace() {
   const panel = $("place"), place = chosen.place;
+  panel.classList.toggle("empty", place < 0);  // left out of a print
   if (!known.places) {
     panel.replaceChildren(make("p", { class: "soft", text: "The map has no places." }));
     return;

@@ -75,7 +75,8 @@ def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
         for wanted in _thinned([*filter(None, places)], MOST // 2):
             sources[wanted.source].add(wanted.frame)
         frames = run.frames["frame"].astype(np.int64).tolist()
-        sources[run.plan.source].update(_thinned(frames, MOST // 2))
+        if frames:
+            sources[run.plan.source].update(_thinned(frames, MOST // 2))
         for spec, numbers in sources.items():
             found, note = _from_source(spec, sorted(numbers), run.brain.config.frame_rate_hz)
             taken |= {Wanted(spec, number): file for number, file in found.items()}

@@ -12,6 +12,7 @@ from neuroslam.errors import NeuroslamError, RunError
 from neuroslam.run_files import (
     FRAME_COLUMNS,
     RunPlan,
+    brain_file,
     read_actions,
     read_frames,
     read_plan,
@@ -57,7 +58,7 @@ def read_run(out: str | Path) -> FinishedRun:
         raise RunError(f"{out}: {what}; expected the folder of a run")
     plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
     rows = brain.clock.frames_seen
-    actions = read_actions(out)
+    actions = read_actions(out, rows)
     if not len(actions) and brain.sessions.merges:
         rows = 0  # two brain files were merged: nobody knows their frames
     if len(actions) < rows:
@@ -74,7 +75,7 @@ def read_run(out: str | Path) -> FinishedRun:
         plan,
         brain,
         frames,
-        actions[:rows],
+        actions,
         {name: column[:rows] for name, column in trace.items()},
         _read_metrics(out),
         read_curves(out, frames["frame"]),
@@ -138,11 +139,12 @@ def session_plans(run: FinishedRun) -> dict[int, RunPlan]:
     left: list[tuple[RunPlan, NavigationBrain]] = [(run.plan, run.brain)]
     while left:
         plan, brain = left.pop()
+        merged = plan.source.endswith(brain_file(run.out).suffix)  # two brain files, see merge
         drive = brain.sessions.this_drive() if brain.sessions.sessions else set()
         for session in brain.sessions.sessions:
-            if session.name in drive:
+            if session.name in drive and not merged:
                 plans.setdefault(session.id, plan)
-        for path in map(Path, plan.maps):
+        for path in map(Path, (plan.source, *plan.maps) if merged else plan.maps):
             if path in asked:
                 continue
             asked.add(path)
