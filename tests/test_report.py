@@ -23,6 +23,7 @@ from neuroslam.report.collect import chosen_rows, config_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
 from neuroslam.runs import resume, run
+from neuroslam.sensors import open_source
 
 WORLD = "world:ellipse?laps=2&width=96&height=24&frames_per_lap=90&people=2"
 QUICK = "--no-tensorboard"
@@ -164,8 +165,6 @@ def test_pictures_are_those_of_the_source(runs, whole):
     assert (number >= 0).all(), "the source is there: every place has its picture"
     data = np.frombuffer(base64.b64decode(whole.pictures[number[3]]), np.uint8)
     shown = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
-    from neuroslam.sensors import open_source
-
     frame = open_source(WORLD).frame(int(whole.arrays["place_first_frame"][3])).image
     assert shown.shape == frame.shape
     assert np.abs(shown.astype(float) - frame).mean() < 10.0  # of 255: compressed
@@ -327,6 +326,23 @@ def test_motion_alone_makes_a_path_without_places(pages):
     assert np.isfinite(page.arrays["row_x_m"]).all()
     assert np.ptp(page.arrays["row_x_m"]) > 0.5
     assert (page.arrays["row_place"] == -1).all()
+
+
+def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
+    folder, n = tmp_path / "carried", 0
+    folder.mkdir()
+    for world in ("world:corridor?width=96&height=48", "world:town?width=96&height=48"):
+        for frame in open_source(world).frames(0, 40):
+            cv2.imwrite(str(folder / f"{n:03d}.png"), frame.image[..., ::-1])
+            n += 1
+    run(folder, tmp_path / "out", tensorboard=False)
+    page = Page(write_report(tmp_path / "out", pictures_mb=0))
+    nowhere = np.isnan(page.arrays["row_x_m"])
+    assert nowhere[:40].all()
+    assert not nowhere[40:].any()
+    assert (page.arrays["row_place"] == -1).tolist() == nowhere.tolist()
+    (left,) = page.about["not_joined"]
+    assert "looked like one of it" in left["reason"]
 
 
 def test_when_an_animal_was_lost_follows_from_its_doubt():

@@ -83,15 +83,16 @@ function startPlayer() {
   watch("colours", paintStrip);
   new ResizeObserver(paintStrip).observe($("strip"));
   addEventListener("keydown", (event) => {
-    const on = event.target;
-    if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input, select, textarea, button, summary, a, #map")) return;
+    const busy = event.key === " " ? "input:not(#slider), select, button, summary, a, #map"
+      : event.key.startsWith("Arrow") ? "input, select, [role=tab], #map" : "input, select, [role=tabpanel], #map";
+    if (event.ctrlKey || event.metaKey || event.altKey || !known.rows || event.target.matches(busy)) return;
     const far = event.shiftKey ? 10 : 1;
     const act = {
       " ": () => player.toggle(),
       ArrowLeft: () => chooseRow(chosen.row - far), ArrowRight: () => chooseRow(chosen.row + far),
       Home: () => chooseRow(0), End: () => chooseRow(known.rows - 1),
     }[event.key];
-    if (act && known.rows && !(event.key !== " " && on.matches('[role="tabpanel"]') && event.key.startsWith("Arrow") === false)) {
+    if (act) {
       act();
       event.preventDefault();
     }
