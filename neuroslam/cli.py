@@ -257,6 +257,23 @@ def plot_command(
     return 0
 
 
+@app.command("report")
+def report_command(
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `merge` wrote.")],
+    to: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write; DIR/report.html.")
+    ] = None,
+    pictures: Annotated[
+        float, typer.Option(help="Room for pictures of frames, in MB; 0: none.")
+    ] = 12.0,
+) -> int:
+    """Write one HTML page that explains a run; it needs nothing but a browser."""
+    from neuroslam.report import write_report
+
+    console.print(f"Written: {write_report(out, to, pictures_mb=pictures)}")
+    return 0
+
+
 @app.command("presets")
 def presets_command() -> int:
     """List the presets and what they are for."""

@@ -8,6 +8,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
@@ -19,7 +20,7 @@ from neuroslam.errors import RunError
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.mapping.tables import Links, origin_key
 from neuroslam.storage import write_atomically
-from neuroslam.types import Frame, Pose, StepResult
+from neuroslam.types import NO_EXPERIENCE, Frame, Pose, StepResult
 
 FRAME_COLUMNS = (
     "frame,time_s,v_m_s,w_rad_s,template,match_error,relative_heading_rad,action,experience,"
@@ -190,6 +191,29 @@ def read_trace(
     return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
 
 
+def places_of(
+    brain: NavigationBrain, trace: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find where every frame was, on the final map.
+
+    Returns:
+        Id of the experience as it is now, ``(frames,)``, -1 where it is not of this map or there
+        was none yet; and the heading that the experience was made with, minus the heading of what
+        it is now, in radians, ``(frames,)``.
+    """
+    origins = brain.map.origins()
+    keys = origin_key(origins._asdict())
+    own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
+    place, turn_rad = np.full(len(own), NO_EXPERIENCE), np.zeros(len(own))
+    if len(keys):
+        order = np.argsort(keys)
+        found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
+        known = (keys[found] == own) & (trace["number"] >= 0)
+        place[known] = origins.experience[found[known]]
+        turn_rad[known] = origins.turn_rad[found[known]]
+    return place, turn_rad
+
+
 def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
     """Place every frame on the final map: each keeps its offset from its experience.
 
@@ -199,16 +223,11 @@ def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarr
         x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the frame's place
         is not of this map: it is of a stored one that was not joined.
     """
-    origins = brain.map.origins()
-    keys = origin_key(origins._asdict())
-    own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
-    order = np.argsort(keys)
-    at = np.full((len(own), 3), np.nan)
-    if len(keys):
-        found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
-        known = (keys[found] == own) & (trace["number"] >= 0)
-        at[known] = brain.map.poses[origins.experience[found[known]]]
-        at[known, 2] += origins.turn_rad[found[known]]
+    place, turn_rad = places_of(brain, trace)
+    on_map = place >= 0
+    at = np.full((len(place), 3), np.nan)
+    at[on_map] = brain.map.poses[place[on_map]]
+    at[:, 2] += turn_rad
     if not brain.sessions.merges:
         at[trace["number"] < 0] = 0.0  # before the first experience
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
@@ -277,6 +296,27 @@ def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarra
     except (ValueError, IndexError) as error:
         raise RunError(f"{path}: damaged ({error})") from None
     return {names[i]: table[:, column] for column, i in enumerate(numbers)}
+
+
+def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:
+    """Read the column of ``frames.csv`` that is no number: what was done, as text ``(frames,)``.
+
+    Args:
+        out: Folder of the run.
+        rows: As for :func:`read_trace`.
+
+    Raises:
+        RunError: As :func:`read_frames`.
+    """
+    path, column = Path(out) / "frames.csv", FRAME_COLUMNS.split(",").index("action")
+    try:
+        with path.open(encoding="utf-8") as file:
+            lines = islice(file, 1, None if rows is None else rows + 1)
+            return np.array([line.split(",")[column] for line in lines], dtype=np.str_)
+    except FileNotFoundError:
+        raise RunError(f"{path}: missing; is {out} a run?") from None
+    except (ValueError, IndexError) as error:
+        raise RunError(f"{path}: damaged ({error})") from None
 
 
 def read_plan(out: str | Path) -> RunPlan:

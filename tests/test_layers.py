@@ -15,7 +15,7 @@ FLOW = [
     "semantic_drawing", "cell_panels", "semantic_panels",
     "merge_drawing", "comparison_drawing", "recording", "run_files",
     "inspection", "export",
-    "review", "runs", "merging", "demo",
+    "review", "report", "runs", "merging", "demo",
     "experiments", "cli",
 ]  # fmt: skip
 SIDE_BY_SIDE = {("odometry", "view"), ("view", "odometry")}

@@ -1,0 +1,364 @@
+"""What a page tells of a run: facts as plain values, everything long as arrays."""
+
+import math
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from pydantic import BaseModel
+
+from neuroslam.brain import NavigationBrain
+from neuroslam.brain.merge import MergeReport
+from neuroslam.config import BrainConfig
+from neuroslam.errors import MapError
+from neuroslam.evaluation.trajectory import align
+from neuroslam.mapping.tables import closes_loop
+from neuroslam.report.reading import Curve, FinishedRun
+from neuroslam.run_files import odometry_track, places_of, trajectory, true_poses
+
+ACTIONS = ("none", "create", "link", "set")
+MOST_ROWS = 100_000
+"""Frames on a page, at most: of longer runs every k-th and those that changed the map."""
+
+_TEMPLATE_BYTES = 4_000_000
+
+# Sections of the config that do nothing, by what `cells` is.
+_UNUSED = {
+    "pose": ("boundary_cells", "grid_cells", "place_cells", "wall_memory"),
+    "place": ("view", "pose_cells"),
+    "pose_and_place": (),
+}
+
+
+class Facts(NamedTuple):
+    """What a page tells of a run.
+
+    Attributes:
+        about: Plain values for JSON: names, counts, reports, config.
+        arrays: ``row_...`` a row a frame, ``place_...`` one an experience, ``link_...``,
+            ``cell_...`` and ``wall_...`` likewise; lengths in m, angles in rad, times in s.
+    """
+
+    about: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def collect(run: FinishedRun) -> Facts:
+    """Collect what a page tells, but for the pictures."""
+    rows = chosen_rows(run.actions)
+    arrays = _rows(run, rows) | _map(run) | _cells(run.brain)
+    notes = []
+    if len(rows) < len(run.actions):
+        notes.append(
+            f"{len(rows):,} of {len(run.actions):,} frames are on this page: every "
+            f"{_stride(len(run.actions))}th, and all that changed the map."
+        )
+    if not len(run.actions):
+        notes.append("Two brain files were merged: no frames belong to this map, only places.")
+    for name, curve in run.curves.items():
+        key = name.rpartition("/")[2]
+        arrays |= {
+            f"{key}_row": np.searchsorted(rows, curve.rows).clip(max=len(rows) - 1),
+            f"{key}_value": curve.values,
+        }
+    about = {
+        "name": run.plan.name,
+        "cells": run.brain.config.cells,
+        "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
+        "threshold": run.brain.config.view.threshold,
+        "actions": ACTIONS,
+        "summary": _summary(run),
+        "sessions": _sessions(run),
+        "merges": [_merge(report, run) for report in run.metrics["merge_reports"]],
+        "refused": [_merge(report, run) for report in run.metrics["refused_merges"]],
+        "not_joined": run.metrics.get("not_joined", []),
+        "skipped": run.metrics.get("skipped", []),
+        "metrics": metric_rows(run.metrics),
+        "config": config_rows(run.brain.config),
+        "range": {"start": run.plan.start, "stop": run.plan.stop,
+                  "on_bad_frame": run.plan.on_bad_frame},
+        "truth_scale": truth_on_map(trajectory(run.brain, run.trace), true_poses(run.trace))[1],
+        "lost": [_within(rows, span) for span in lost_spans(run)],
+        "notes": notes,
+    }  # fmt: skip
+    lost_s = run.metrics.get("lost_s", 0.0)
+    if lost_s and not about["lost"]:
+        notes.append(
+            f"The robot was lost for {lost_s:.1f} s in all; when is kept in events/ only, "
+            "which this run does not have."
+        )
+    return Facts(about, arrays)
+
+
+def chosen_rows(actions: np.ndarray) -> np.ndarray:
+    """Choose the frames that a page holds: all of them, unless there are very many.
+
+    Example:
+        >>> chosen_rows(np.array(["create", "none", "none"])).tolist()
+        [0, 1, 2]
+    """
+    n = len(actions)
+    if n <= MOST_ROWS:
+        return np.arange(n)
+    some = [np.arange(0, n, _stride(n)), np.flatnonzero(actions != "none"), [n - 1]]
+    return np.unique(np.concatenate(some))
+
+
+def _stride(n: int) -> int:
+    return math.ceil(n / MOST_ROWS)
+
+
+def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Everything that has a row a frame; places and poses are those of the final map."""
+    frames, trace, brain = run.frames, run.trace, run.brain
+    place = places_of(brain, trace)[0]
+    track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
+    truth = truth_on_map(track, true_poses(trace))[0]
+    whole = {
+        "frame": frames["frame"].astype(np.int32),
+        "time_s": frames["time_s"],
+        "place": place.astype(np.int32),
+        "action": np.array([ACTIONS.index(name) for name in run.actions.tolist()], np.uint8),
+        "x_m": track[:, 0],
+        "y_m": track[:, 1],
+        "theta_rad": track[:, 2],
+        "odometry_x_m": odometry[:, 0],
+        "odometry_y_m": odometry[:, 1],
+        **({} if truth is None else {"truth_x_m": truth[:, 0], "truth_y_m": truth[:, 1]}),
+    }
+    for name in ("v_m_s", "w_rad_s", "match_error", "pose_x", "pose_y", "pose_theta"):
+        whole[name] = frames[name]
+    for name in ("template", "n_templates", "n_experiences", "n_links"):
+        whole[name] = frames[name].astype(np.int32)
+    return {f"row_{name}": column[rows] for name, column in whole.items()}
+
+
+def truth_on_map(
+    track: np.ndarray, truth: np.ndarray | None
+) -> tuple[np.ndarray | None, float | None]:
+    """Lay the true track over the map, as ``map.png`` lays the map over the truth.
+
+    Returns:
+        Positions ``(frames, 2)`` in metres of the map, and metres of the truth in one of them;
+        ``None`` where there is no truth, or nothing tells how it lies.
+    """
+    on_map = np.isfinite(track[:, 0])
+    if truth is None or not on_map.any():
+        return None, None
+    try:
+        motion = align(track[on_map, :2], truth[on_map, :2], "similarity")
+    except MapError:  # the robot stood still, or went straight
+        return None, None
+    return motion.undo(truth[:, :2]), motion.scale
+
+
+def _map(run: FinishedRun) -> dict[str, np.ndarray]:
+    brain = run.brain
+    table = {name: brain.map.experiences[name].numpy() for name in brain.map.experiences.columns}
+    links, known = brain.map.links, {s.id: i for i, s in enumerate(brain.sessions.sessions)}
+    poses = brain.map.poses
+    return {
+        "place_x_m": poses[:, 0],
+        "place_y_m": poses[:, 1],
+        "place_theta_rad": poses[:, 2],
+        "place_cell": table["cell"],
+        "place_template": table["template"].astype(np.int32),
+        "place_first_frame": table["first_frame"].astype(np.int32),
+        "place_session": np.array([known.get(s, 0) for s in table["session"].tolist()], np.int32),
+        "link_from": links.source.astype(np.int32),
+        "link_to": links.target.astype(np.int32),
+        "link_distance_m": links.distance_m,
+        "link_facing_rad": links.facing_rad,
+        "link_duration_s": links.duration_s,
+        "link_off_m": brain.map.residuals_m,
+        "link_loop": closes_loop(links.source, links.target).astype(np.uint8),
+        "templates": template_pictures(brain),
+    }
+
+
+def template_pictures(brain: NavigationBrain) -> np.ndarray:
+    """Return the templates as grey pictures, ``uint8``, ``(n, h, w)``; smaller if they are many."""
+    view = brain.config.view
+    height, width = view.template_height, view.template_width
+    if not brain.view.n:
+        return np.zeros((0, height, width), np.uint8)
+    pictures = np.stack([brain.view.template_image(i) for i in range(brain.view.n)])
+    shrink = math.sqrt(pictures.nbytes / _TEMPLATE_BYTES)
+    if shrink <= 1.0:
+        return pictures
+    size = (max(1, int(width / shrink)), max(1, int(height / shrink)))
+    return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in pictures])
+
+
+def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
+    """The activity of the cells at the end of the run, and place cells with what they know."""
+    arrays = {}
+    if brain.config.cells != "place":
+        activity = brain.pose_cells.activity.numpy(force=True)
+        arrays |= {"activity_xy": activity.sum(axis=0), "activity_theta_x": activity.sum(axis=1)}
+    if brain.config.cells != "pose":
+        place = brain.navigation.place
+        centres, links = (part.numpy(force=True) for part in place.graph())
+        n = len(centres)
+        wall = brain.navigation.walls.remembered()[0]
+        x, y, bearing, distance = (column.numpy(force=True) for column in wall[:4])
+        arrays |= {
+            "cell_x_m": centres[:, 0],
+            "cell_y_m": centres[:, 1],
+            "cell_visits": place.visits[0, :n].numpy(force=True).astype(np.int32),
+            "cell_time_s": place.time_s[0, :n].numpy(force=True),
+            "cell_links": links.astype(np.int32),
+            "wall_x_m": x + distance * np.cos(bearing),
+            "wall_y_m": y + distance * np.sin(bearing),
+            "wall_bearing_rad": bearing,
+        }
+    return arrays
+
+
+def lost_spans(run: FinishedRun) -> list[tuple[int, int]]:
+    """Find when the robot was lost, from the doubt that ``events/`` tells of.
+
+    It is lost from when its doubt exceeds ``wall_memory.lost_after_s`` until it is gone, as
+    :class:`~neuroslam.cells.familiarity.Familiarity` has it.
+
+    Returns:
+        First and last row of ``frames.csv``, to the distance of two recorded points.
+    """
+    doubt = run.curves.get("cells/doubt_s")
+    if doubt is None:
+        return []
+    return spans_above(doubt, run.brain.config.wall_memory.lost_after_s)
+
+
+def spans_above(curve: Curve, limit: float) -> list[tuple[int, int]]:
+    """Find the rows from where a curve exceeds a limit to where it is back at 0.
+
+    Example:
+        >>> spans_above(Curve(np.arange(6), np.array([0.0, 1, 3, 1, 0, 1])), 2.0)
+        [(2, 4)]
+    """
+    spans, began = [], None
+    for row, value in zip(curve.rows.tolist(), curve.values.tolist(), strict=True):
+        if began is None and value > limit:
+            began = row
+        elif began is not None and value <= 0.0:
+            spans.append((began, row))
+            began = None
+    return spans if began is None else [*spans, (began, int(curve.rows[-1]))]
+
+
+def _within(rows: np.ndarray, span: tuple[int, int]) -> list[int]:
+    """Say where a span lies among the rows that the page holds."""
+    return [int(i) for i in np.searchsorted(rows, span).clip(max=len(rows) - 1)]
+
+
+def _summary(run: FinishedRun) -> dict[str, Any]:
+    brain, frames, links = run.brain, run.frames, run.brain.map.links
+    times, trace = frames["time_s"], run.trace
+    width, height = np.ptp(brain.map.poses[:, :2], axis=0) if brain.map.n else (0.0, 0.0)
+    return {
+        "frames": len(times),
+        "seconds": float(times[-1] - times[0]) if len(times) else 0.0,
+        "driven_m": float(np.abs(trace["v_m_s"] * trace["dt_s"]).sum()),
+        "places": brain.map.n,
+        "templates": brain.view.n,
+        "links": brain.map.n_links,
+        "loop_closures": int(closes_loop(links.source, links.target).sum()),
+        "width_m": float(width),
+        "height_m": float(height),
+        "current": brain.map.current,
+        "robot": list(brain.map.pose),
+        "interrupted": bool(run.metrics.get("interrupted")),
+        "ate_m": run.metrics.get("ate_rmse_m"),
+        "odometry_ate_m": run.metrics.get("odometry_ate_rmse_m"),
+    }
+
+
+def _sessions(run: FinishedRun) -> list[dict[str, Any]]:
+    log = run.brain.sessions
+    drive = log.this_drive() if log.sessions else set()
+    return [
+        {
+            "name": session.name,
+            "source": session.source,
+            "preset": session.preset,
+            "recorded": session.recorded,
+            "frames": session.frames,
+            "first_frame": session.first_frame,
+            "began": session.began,
+            "own": session.name in drive,
+        }
+        for session in log.sessions
+    ]
+
+
+def _merge(report: dict[str, Any], run: FinishedRun) -> dict[str, Any]:
+    """Write a report for a reader, with the place where it happened as it is named now."""
+    place = None
+    if report["at_frame"] is None and report["merged"] and report == run.brain.sessions.merges[-1]:
+        place = report["match"].get("loaded_experience")  # a later merge would have renamed it
+    return {
+        "lines": MergeReport(**report).lines(),
+        "frame": report["at_frame"],
+        "place": place,
+        "loaded": report["loaded_sessions"],
+        "partial": report["partial_sessions"],
+    }
+
+
+def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
+    """List the figures of ``metrics.json``: name, value, unit; lists have places of their own.
+
+    Example:
+        >>> metric_rows({"frames": 3, "seconds": 1.5, "skipped": [], "ate_rmse_m": 0.2})
+        [['frames', 3, ''], ['seconds', 1.5, ''], ['ate rmse', 0.2, 'm']]
+    """
+    rows = []
+    for key, value in metrics.items():
+        if isinstance(value, list | dict):
+            continue
+        name, unit = key, ""
+        if key.endswith(("_m", "_s")) and "_per_" not in key:
+            name, _, unit = key.rpartition("_")
+        finite = not isinstance(value, float) or math.isfinite(value)
+        rows.append([name.replace("_", " "), value if finite else str(value), unit])
+    return rows
+
+
+def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
+    """List every parameter by section: value, default, whether they differ, what it does."""
+    plain = BrainConfig()
+    general: dict[str, Any] = {"section": "brain", "used": True, "rows": []}
+    sections = [general]
+    for name, field in BrainConfig.model_fields.items():
+        value, default = getattr(config, name), getattr(plain, name)
+        if not isinstance(value, BaseModel):
+            general["rows"].append(_parameter(name, value, default, field.description))
+            continue
+        rows = [
+            _parameter(key, getattr(value, key), getattr(default, key), inner.description)
+            for key, inner in type(value).model_fields.items()
+        ]
+        used = name not in _UNUSED.get(config.cells, ())
+        sections.append({"section": name, "used": used, "rows": rows})
+    return sections
+
+
+def _parameter(key: str, value: object, default: object, what: str | None) -> dict[str, Any]:
+    return {
+        "key": key,
+        "value": _written(value),
+        "default": _written(default),
+        "differs": value != default,
+        "what": what or "",
+    }
+
+
+def _written(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple | list):
+        return ", ".join(map(_written, value))
+    return str(value)

@@ -1,0 +1,145 @@
+"use strict";
+// The parts of the page that are text: headline, sessions and merges, figures, config, notes.
+
+function startHeadline() {
+  const s = about.summary, parts = [];
+  if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} m driven`);
+  parts.push(many(s.places, "place"), many(s.loop_closures, "loop closure"));
+  if (about.sessions.length > 1) parts.push(many(about.sessions.length, "session"));
+  if (about.merges.length) parts.push(many(about.merges.length, "merge"));
+  if (s.ate_m !== null) parts.push(`error ${metres(s.ate_m)} (odometry alone ${metres(s.odometry_ate_m)})`);
+  if (s.interrupted) parts.push("interrupted");
+  $("headline").textContent = parts.join(" · ");
+  $("headline").title = $("headline").textContent;
+}
+
+function tableOf(names, rows) {
+  return make("div", { class: "scroll" }, make("table", {},
+    make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
+}
+
+const BEGAN = { start: "the run", carried: "the robot was carried", gap: "a gap in the frames" };
+
+function startSessions() {
+  const list = $("session-list"), places = new Array(about.sessions.length).fill(0);
+  for (const session of run.place_session) places[session]++;
+  list.append(make("div", { class: "card text" }, tableOf(["session", "source", "began with", "frames", "places", ""],
+    about.sessions.map((session, i) => make("tr", {},
+      make("td", {}, make("i", { class: "swatch", style: { background: sessionColour(i) } }), session.name),
+      make("td", { text: [session.source || "unknown", session.preset && `preset ${session.preset}`, session.recorded].filter(Boolean).join(", ") }),
+      make("td", { text: BEGAN[session.began] ?? session.began }),
+      make("td", { text: `${session.frames.toLocaleString("en")} from ${session.first_frame}` }),
+      make("td", { text: places[i].toLocaleString("en") }),
+      make("td", { class: "soft", text: session.own ? "this run" : "stored map" }))))));
+  const points = mergePoints();
+  for (const report of about.merges) {
+    const point = points.find((one) => (report.frame === null ? one.place === report.place : one.row === rowOfFrame(report.frame)));
+    list.append(reportCard("Merged", report, point));
+  }
+  for (const report of about.refused) list.append(reportCard("Refused", report, null));
+  for (const stored of about.not_joined) {
+    list.append(make("div", { class: "card text" }, make("h3", { text: `Not joined: the map of ${stored.sessions.join(", ")}` }), make("p", { class: "soft", text: stored.reason })));
+  }
+  if (!about.merges.length && !about.refused.length && !about.not_joined.length) {
+    list.append(make("p", { class: "lead", text: "One map, no merges." }));
+  }
+  watch("colours", () => list.querySelectorAll("tbody .swatch").forEach((swatch, i) => { swatch.style.background = sessionColour(i); }));
+}
+
+function reportCard(what, report, point) {
+  const [first, ...others] = report.lines;
+  const heading = `${what}${report.frame === null ? "" : ` at frame ${report.frame}`}: ${first.replace(/^(not )?merged: /, "")}`;
+  const card = make("div", { class: "card text" }, make("h3", { text: heading }),
+    make("p", { class: "soft", text: `session ${report.partial.at(-1)} into ${report.loaded.join(", ")}` }),
+    make("ul", {}, ...others.map((text) => make("li", { text }))));
+  if (point) {
+    card.append(make("button", { type: "button", text: "Show on the map", onclick: () => {
+      if (point.row >= 0) chooseRow(point.row);
+      choosePlace(point.place);
+      $("explorer").scrollIntoView();
+    } }));
+  } else if (report.frame !== null && known.rows) {
+    card.append(make("button", { type: "button", text: "Go to the frame", onclick: () => { chooseRow(rowOfFrame(report.frame)); $("explorer").scrollIntoView(); } }));
+  }
+  return card;
+}
+
+function figure(value) {
+  if (typeof value === "boolean") return value ? "yes" : "no";
+  if (typeof value !== "number") return String(value);
+  return Number.isInteger(value) ? value.toLocaleString("en") : Number(value.toPrecision(4)).toString();
+}
+
+function startMetrics() {
+  $("metric-list").append(make("div", { class: "figures" },
+    ...about.metrics.map(([name, value, unit]) => make("div", {}, make("span", { class: "soft", text: name }), make("span", { text: `${figure(value)} ${unit}`.trim() })))));
+  if (about.skipped.length) {
+    $("metric-list").append(make("details", {}, make("summary", { text: `${many(about.skipped.length, "frame")} skipped` }),
+      make("ul", {}, ...about.skipped.slice(0, 200).map((text) => make("li", { text })))));
+  }
+}
+
+function startConfig() {
+  const all = about.config.flatMap((part) => part.rows), differing = all.filter((row) => row.differs);
+  const box = make("input", { type: "checkbox", id: "only" }), columns = make("div", { class: "config-columns" });
+  box.addEventListener("change", () => columns.classList.toggle("only-differing", box.checked));
+  const { start, stop, on_bad_frame } = about.range;
+  $("config-list").append(
+    make("p", { class: "lead", text: `${differing.length} of ${all.length} parameters differ from their defaults; they are marked. Frames ${start} to ${stop === null ? "the end" : stop - 1} of the source, a bad frame: ${on_bad_frame}.` }),
+    make("label", {}, box, " only what differs"), columns);
+  for (const part of about.config) {
+    const has = part.rows.some((row) => row.differs);
+    columns.append(make("div", { class: `config-part${part.used ? "" : " unused"}${has ? " has-differing" : ""}` },
+      make("h3", { text: part.section + (part.used ? "" : ", not in use") }),
+      make("table", {}, make("tbody", {}, ...part.rows.map((row) => make("tr", { class: row.differs ? "differs" : "", title: row.what },
+        make("td", { text: row.key }), make("td", { text: row.value }),
+        make("td", { class: "soft", text: row.differs ? `default ${row.default}` : "" })))))));
+  }
+}
+
+function startNotes() {
+  const keys = [["space", "play, pause"], ["← →", "one frame; with shift ten"], ["home end", "first and last frame"],
+    ["on the map: arrows", "move"], ["+ −", "zoom"], ["0", "show all"], ["N P", "next and previous place"], ["enter", "the place nearest the middle"]];
+  const notes = [
+    "Places, links and the path are those of the final map: a frame keeps its offset from its place, so the path moves with the map.",
+    "The path grows with the slider; places fill in when the robot first comes to them. A loop closure is a link between places that were both known.",
+    ...(run.row_truth_x_m ? [`The truth is turned, shifted and scaled to lie over the path: one metre of the map is ${figure(about.truth_scale)} m. The errors among the figures are without scaling.`] : []),
+    ...about.notes, ...about.picture_notes,
+    pictures.length ? `${many(pictures.length, "picture")} of frames are in this page; the frame shown is the nearest one before the slider that has a picture.` : "No pictures of frames are in this page.",
+    "The page is one file and asks nothing of the network.",
+  ];
+  $("note-list").append(make("ul", {}, ...notes.map((text) => make("li", { text }))),
+    make("p", {}, ...keys.flatMap(([key, what]) => [make("kbd", { text: key }), ` ${what}   `])));
+}
+
+function startLayers() {
+  const there = { truth: !!run.row_truth_x_m, walls: about.cells === "place" && !!run.wall_x_m, merges: mergePoints().length > 0,
+    odometry: known.rows > 0, whole: known.rows > 0, track: known.rows > 0, loops: known.loops.length > 0 };
+  for (const [name, layer] of Object.entries(layers)) {
+    if (there[name] === false) { layer.on = false; continue; }
+    const box = make("input", { type: "checkbox", "data-layer": name });
+    box.checked = layer.on;
+    box.addEventListener("change", () => { layer.on = box.checked; map.forget(); map.draw(); showLegend(); });
+    $("layers").append(make("label", {}, box, layer.name));
+  }
+  for (const [name, text] of Object.entries(colourings)) $("colouring").append(make("option", { value: name, text }));
+  $("colouring").addEventListener("change", (event) => { map.colouring = event.target.value; map.bins = null; map.forget(); map.draw(); showLegend(); });
+  watch("colours", showLegend);
+}
+
+function showLegend() {
+  const items = [], add = (kind, style, text) => items.push(make("span", {}, make("i", { class: kind, style }), text));
+  const colour = (value) => ({ borderColor: value });
+  if (map.colouring === "session") {
+    if (about.sessions.length < 2) add("key-dot", { background: sessionColour(0) }, about.cells === "place" ? "places (place cells)" : "places");
+    else about.sessions.slice(0, 6).forEach((session, i) => add("key-dot", { background: sessionColour(i) }, `session ${i + 1}${session.own ? ", this run" : ""}`));
+  } else add("key-ramp", { background: rampStyle }, `few to many: ${colourings[map.colouring]}`);
+  if (layers.links.on) add("key-line", colour(colours.link), "links");
+  if (layers.loops.on) add("key-line", colour(colours.loop), "loop closures");
+  if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
+  if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
+  if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, the map scaled by ${about.truth_scale.toFixed(2)}`);
+  if (layers.merges.on) add("key-ring", colour(colours.match), "maps joined here");
+  if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "walls as remembered");
+  $("legend").replaceChildren(...items);
+}
