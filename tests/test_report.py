@@ -317,7 +317,7 @@ def test_an_animal_without_a_camera_has_place_cells_and_walls(runs, pages):
                                            "it has no camera."]  # fmt: skip
     assert len(page.arrays["doubt_s_row"]) > 10
     unused = {part["section"] for part in page.about["config"] if not part["used"]}
-    assert unused == {"view", "pose_cells"}
+    assert unused == {"view", "pose_cells", "semantic"}
 
 
 def test_motion_alone_makes_a_path_without_places(pages):

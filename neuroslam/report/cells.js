@@ -158,7 +158,7 @@ function paintPlaceCells(pen, width, height) {
 }
 
 function startCells() {
-  if (about.cells !== "place") {
+  if (about.cells.includes("pose")) {
     if (known.rows) {
       const note = `Its path over the torus in the last ${TRAIL_S} s up to the frame; the arrow is its heading. Edges meet. Dots: where places are bound.`;
       const panels = [makePanel("Packet of the pose cells", note, paintTorus, 0.95), makePanel("Pose cells, the last " + TRAIL_S + " s", note, paintTorus, 0.95, $("now-cells"))];
@@ -166,7 +166,7 @@ function startCells() {
     }
     makePanel("Activity at the end of the run", "Left summed over heading, right over y; yellow is most. A run keeps the activity of its end only.", paintActivity, 0.62);
   }
-  if (about.cells !== "pose") {
+  if (about.cells.includes("place")) {
     const cells = run.cell_x_m.length, walls = run.wall_x_m.length;
     let longest = 0;
     for (const seconds of run.cell_time_s) longest = Math.max(longest, seconds);

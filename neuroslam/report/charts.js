@@ -183,7 +183,7 @@ function startCharts() {
     ...(run.templates.shape[0] ? [{ name: "templates", digits: 0, colour: () => colours.path, value: column("row_n_templates") }] : []),
   ], { low: 0 });
   const [nXY, nTheta] = about.torus;
-  if (about.cells !== "place") {
+  if (about.cells.includes("pose")) {
     add("Pose cells", "centre of the packet on the torus, in cells", 120, [
       { name: "x", around: nXY, digits: 1, colour: () => colours.map, value: column("row_pose_x") },
       { name: "y", around: nXY, digits: 1, colour: () => colours.loop, value: column("row_pose_y") },

@@ -23,11 +23,16 @@ MOST_ROWS = 100_000
 _TEMPLATE_BYTES = 4_000_000
 
 # Sections of the config that do nothing, by what `cells` is.
-_UNUSED = {
-    "pose": ("boundary_cells", "grid_cells", "place_cells", "wall_memory"),
-    "place": ("view", "pose_cells"),
-    "pose_and_place": (),
+_USED_BY = {
+    "view": "pose",
+    "pose_cells": "pose",
+    "boundary_cells": "place",
+    "grid_cells": "place",
+    "place_cells": "place",
+    "wall_memory": "place",
+    "semantic": "semantic",
 }
+"""Sections of the config that only some brains use, and which cells those have."""
 
 
 class Facts(NamedTuple):
@@ -63,7 +68,7 @@ def collect(run: FinishedRun) -> Facts:
         }
     about = {
         "name": run.plan.name,
-        "cells": run.brain.config.cells,
+        "cells": list(run.brain.config.cells),
         "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
         "threshold": run.brain.config.view.threshold,
         "actions": ACTIONS,
@@ -193,10 +198,10 @@ def template_pictures(brain: NavigationBrain) -> np.ndarray:
 def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
     """The activity of the cells at the end of the run, and place cells with what they know."""
     arrays = {}
-    if brain.config.cells != "place":
+    if brain.config.has("pose"):
         activity = brain.pose_cells.activity.numpy(force=True)
         arrays |= {"activity_xy": activity.sum(axis=0), "activity_theta_x": activity.sum(axis=1)}
-    if brain.config.cells != "pose":
+    if brain.config.has("place"):
         place = brain.navigation.place
         centres, links = (part.numpy(force=True) for part in place.graph())
         n = len(centres)
@@ -212,6 +217,8 @@ def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
             "wall_y_m": y + distance * np.sin(bearing),
             "wall_bearing_rad": bearing,
         }
+    if (spots := brain.landmarks_m) is not None:
+        arrays |= {"landmark_x_m": spots[:, 0], "landmark_y_m": spots[:, 1]}
     return arrays
 
 
@@ -335,13 +342,21 @@ def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
         if not isinstance(value, BaseModel):
             general["rows"].append(_parameter(name, value, default, field.description))
             continue
-        rows = [
-            _parameter(key, getattr(value, key), getattr(default, key), inner.description)
-            for key, inner in type(value).model_fields.items()
-        ]
-        used = name not in _UNUSED.get(config.cells, ())
-        sections.append({"section": name, "used": used, "rows": rows})
+        used = name not in _USED_BY or config.has(_USED_BY[name])
+        sections.append({"section": name, "used": used, "rows": _parameters(value, default, "")})
     return sections
+
+
+def _parameters(value: BaseModel, default: BaseModel, path: str) -> list[dict[str, Any]]:
+    """A section's own parameters, then those of the sections within it."""
+    rows = []
+    for key, field in type(value).model_fields.items():
+        mine, plain = getattr(value, key), getattr(default, key)
+        if isinstance(mine, BaseModel):
+            rows += _parameters(mine, plain, f"{path}{key}.")
+        else:
+            rows.append(_parameter(f"{path}{key}", mine, plain, field.description))
+    return rows
 
 
 def _parameter(key: str, value: object, default: object, what: str | None) -> dict[str, Any]:

@@ -14,6 +14,7 @@ const layers = {
   odometry: { name: "Odometry alone", on: false },
   truth: { name: "Truth", on: true },
   walls: { name: "Remembered walls", on: true },
+  landmarks: { name: "Landmarks", on: true },
   merges: { name: "Merge points", on: true },
   ids: { name: "Ids of places", on: true },
 };
@@ -187,7 +188,8 @@ function line(pen, at, xs, ys, first = 0, last = xs.length - 1) {
 
 function paintStill(pen, at, dot) {
   pen.lineJoin = pen.lineCap = "round";
-  if (layers.walls.on && run.wall_x_m && about.cells === "place") drawWalls(pen, at);
+  if (layers.walls.on && run.wall_x_m && !about.cells.includes("pose")) drawWalls(pen, at);
+  if (layers.landmarks.on && run.landmark_x_m) drawLandmarks(pen, at);
   if (layers.odometry.on) {
     pen.strokeStyle = colours.odometry;
     pen.lineWidth = 1;
@@ -295,6 +297,23 @@ function drawPlaces(pen, at, dot, places) {
       else { pen.moveTo(x + dot, y); pen.arc(x, y, dot, 0, 7); }
     }
     pen.fill();
+  }
+}
+
+function drawLandmarks(pen, at) {
+  pen.fillStyle = colours.landmark;
+  pen.strokeStyle = colours.ink;
+  pen.lineWidth = 0.8;
+  for (let i = 0; i < run.landmark_x_m.length; i++) {
+    const x = at.sx(run.landmark_x_m[i]), y = at.sy(run.landmark_y_m[i]);
+    pen.beginPath();
+    for (let k = 0; k < 10; k++) {  // a star
+      const far = k % 2 ? 3 : 7, angle = (k / 5 - 0.5) * Math.PI;
+      pen.lineTo(x + far * Math.cos(angle), y + far * Math.sin(angle));
+    }
+    pen.closePath();
+    pen.fill();
+    pen.stroke();
   }
 }
 

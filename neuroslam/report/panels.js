@@ -92,7 +92,7 @@ function showNow() {
   const caption = taken ? (shownFrame === frame ? `frame ${frame}` : `frame ${shownFrame}, nearest picture`) : `frame ${frame}`;
   const error = run.row_match_error[row], lost = isLost(row);
   const hasViews = run.templates.shape[0] > 0;
-  const poses = about.cells === "place" ? null
+  const poses = !about.cells.includes("pose") ? null
     : `${run.row_pose_x[row].toFixed(1)}, ${run.row_pose_y[row].toFixed(1)}, ${run.row_pose_theta[row].toFixed(1)} cells`;
   const at = run.row_x_m[row] === run.row_x_m[row]
     ? `${run.row_x_m[row].toFixed(2)} m, ${run.row_y_m[row].toFixed(2)} m, ${degrees(run.row_theta_rad[row])}`

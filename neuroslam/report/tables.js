@@ -113,7 +113,7 @@ function startNotes() {
 }
 
 function startLayers() {
-  const there = { truth: !!run.row_truth_x_m, walls: about.cells === "place" && !!run.wall_x_m, merges: mergePoints().length > 0,
+  const there = { truth: !!run.row_truth_x_m, walls: !about.cells.includes("pose") && !!run.wall_x_m, landmarks: !!run.landmark_x_m && run.landmark_x_m.length > 0, merges: mergePoints().length > 0,
     odometry: known.rows > 0, whole: known.rows > 0, track: known.rows > 0, loops: known.loops.length > 0 };
   for (const [name, layer] of Object.entries(layers)) {
     if (there[name] === false) { layer.on = false; continue; }
@@ -131,7 +131,7 @@ function showLegend() {
   const items = [], add = (kind, style, text) => items.push(make("span", {}, make("i", { class: kind, style }), text));
   const colour = (value) => ({ borderColor: value });
   if (map.colouring === "session") {
-    if (about.sessions.length < 2) add("key-dot", { background: sessionColour(0) }, about.cells === "place" ? "places (place cells)" : "places");
+    if (about.sessions.length < 2) add("key-dot", { background: sessionColour(0) }, !about.cells.includes("pose") ? "places (place cells)" : "places");
     else about.sessions.slice(0, 6).forEach((session, i) => add("key-dot", { background: sessionColour(i) }, `session ${i + 1}${session.own ? ", this run" : ""}`));
   } else add("key-ramp", { background: rampStyle }, `few to many: ${colourings[map.colouring]}`);
   if (layers.links.on) add("key-line", colour(colours.link), "links");
@@ -141,5 +141,6 @@ function showLegend() {
   if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, the map scaled by ${about.truth_scale.toFixed(2)}`);
   if (layers.merges.on) add("key-ring", colour(colours.match), "maps joined here");
   if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "walls as remembered");
+  if (layers.landmarks.on) add("key-dot", { background: colours.landmark }, "landmarks");
   $("legend").replaceChildren(...items);
 }
