@@ -14,7 +14,9 @@ from neuroslam.errors import BadFrame, MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
 from neuroslam.semantic_sections import SemanticConfig
 from neuroslam.sensors import open_source
-from neuroslam.spiking.semantic import Guide, SemanticCells, Sightings, shared_frames
+from neuroslam.spiking.landmark_frames import shared_frames
+from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.spiking.sightings import Guide, Sightings
 from neuroslam.types import Frame, Motion, Pose, Velocity
 
 SETS = [

@@ -27,7 +27,8 @@ from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.population import Population, Running, State
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
-from neuroslam.spiking.semantic import VIEW, Guide, SemanticCells, Sightings, Told
+from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.spiking.sightings import VIEW, Guide, Sightings, Told
 from neuroslam.storage import Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,

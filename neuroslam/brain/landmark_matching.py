@@ -8,7 +8,9 @@ import numpy as np
 from neuroslam.brain.merge import Match
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.overlap import Pairs
-from neuroslam.spiking.semantic import NAMED, SemanticCells, shared_frames
+from neuroslam.spiking.landmark_frames import shared_frames
+from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.spiking.sightings import NAMED
 from neuroslam.types import Pose
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.joining import links_kept
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.population import Join, Population, State
-from neuroslam.spiking.semantic import shared_frames
+from neuroslam.spiking.landmark_frames import shared_frames
 from neuroslam.types import NO_TEMPLATE, Pose
 
 if TYPE_CHECKING:

@@ -1,120 +1,29 @@
 """The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
 
 import math
-from collections.abc import Callable
-from itertools import combinations
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuroslam.errors import BadFrame, MapError
+from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angle
 from neuroslam.population import Join, Population, State, without_gradients
 from neuroslam.semantic_sections import SemanticConfig
 from neuroslam.sensors.landmarks import LandmarkView
 from neuroslam.spiking.decoding import PositionDecoder
+from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated
+from neuroslam.spiking.sightings import LEAST_SEEN, NAMED, NAMELESS, VIEW, Guide, Sightings, Told
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import Motion, Pose
 
-NAMED, VIEW, NAMELESS = 0, 1, 2
-"""Kinds of landmarks: with a number of its own, a known view, told apart by place alone."""
-
 _KINDS = ("landmark", "view", "nameless")
-_LEAST_SEEN = 3  # times that a landmark was seen, before it counts: outliers are seen once
 _KNOWN = 0.5  # strength of a recall from which a landmark is known
 _CONSENSUS = 3  # known landmarks in sight, from which on they can outvote one
 _MOVED_M = 0.05  # by which a landmark moves with its experience before memory is rewritten
 _NEAR_M = 0.5  # nearer landmarks say nothing of the heading
-
-
-class Sightings(NamedTuple):
-    """Landmarks in sight at one instant, ``(n,)`` each.
-
-    Attributes:
-        kind: ``NAMED``, ``VIEW`` or ``NAMELESS``.
-        number: Its own number; of nameless ones it does not count.
-        distance_m: From the robot.
-        bearing_rad: Relative to the heading.
-    """
-
-    kind: np.ndarray
-    number: np.ndarray
-    distance_m: np.ndarray
-    bearing_rad: np.ndarray
-
-    @classmethod
-    def of(cls, *tables: np.ndarray) -> "Sightings":
-        """Take number, distance and bearing of landmarks, ``(n, 3)`` of each sensor.
-
-        Raises:
-            BadFrame: If the rows cannot be that.
-
-        Example:
-            >>> Sightings.of(np.array([[7.0, 2.0, 0.1]])).with_view(3).kind.tolist()
-            [0, 1]
-        """
-        tables = tuple(np.asarray(rows, dtype=np.float64) for rows in tables)
-        for rows in tables:
-            if rows.ndim != 2 or rows.shape[1] != 3:
-                raise BadFrame(
-                    f"landmarks have shape {rows.shape}; expected (n, 3): number, distance, bearing"
-                )
-        rows = np.concatenate((np.empty((0, 3)), *tables))
-        if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
-            raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
-        kind = np.where(rows[:, 0] < 0, NAMELESS, NAMED)
-        return cls(kind, rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2])
-
-    def with_view(self, view: int) -> "Sightings":
-        """Add a known view: a landmark at which the robot stands when it sees it."""
-        row = (VIEW, view, 0.0, 0.0)
-        return Sightings(*(np.append(column, x) for column, x in zip(self, row, strict=True)))
-
-
-class Guide(NamedTuple):
-    """Where a map or other cells say that the robot is.
-
-    Attributes:
-        pose: Of the robot.
-        variance_m2: How sure that is.
-        experience: That the robot is at, on a map that is relaxed; -1: there is none.
-        poses: Of all experiences, ``(n, 3)``.
-    """
-
-    pose: Pose
-    variance_m2: float = 0.0
-    experience: int = -1
-    poses: np.ndarray = np.empty((0, 3))
-
-    @property
-    def at(self) -> np.ndarray:
-        """Pose of the experience that the robot is at, ``(3,)``."""
-        return self.poses[self.experience]
-
-
-class Told(NamedTuple):
-    """What the semantic cells say after a frame.
-
-    Attributes:
-        correction_m: By how much landmarks corrected the position just now.
-        turn_rad: And the heading.
-        place_m: Where a known landmark puts the robot; ``None``: no other than a moment ago.
-        variance_m2: How sure the robot was of its place when it learnt that landmark.
-        landmark: Row of the landmark that is attended to, or -1.
-        is_new: It is seen for the first time.
-        lost: A known landmark contradicts for long; the robot is where ``place_m`` says.
-    """
-
-    correction_m: tuple[float, float]
-    turn_rad: float
-    place_m: tuple[float, float] | None
-    variance_m2: float
-    landmark: int
-    is_new: bool
-    lost: bool
 
 
 class SemanticCells(Population):
@@ -186,7 +95,7 @@ class SemanticCells(Population):
 
     def _counts(self) -> Tensor:
         """Tell which landmarks were seen so often that they are none by mistake."""
-        return (self.known["seen"] >= _LEAST_SEEN) | (self.known["kind"] == VIEW)
+        return (self.known["seen"] >= LEAST_SEEN) | (self.known["kind"] == VIEW)
 
     @property
     def pose(self) -> Pose:
@@ -306,7 +215,7 @@ class SemanticCells(Population):
             row: Of the landmark, or -1.
             n: Places that the map has; a landmark that is none becomes the next.
         """
-        if row < 0 or int(self.known["seen"][row]) < _LEAST_SEEN:
+        if row < 0 or int(self.known["seen"][row]) < LEAST_SEEN:
             return -1, None
         if int(self.known["experience"][row]) < 0:
             self.known["experience"][row] = n
@@ -443,7 +352,7 @@ class SemanticCells(Population):
 
         with :math:`d_i` the vector seen and :math:`m_i` where the landmark is recalled to be.
         """
-        known = (kind != VIEW) & (self.known["seen"].numpy()[rows] >= _LEAST_SEEN)
+        known = (kind != VIEW) & (self.known["seen"].numpy()[rows] >= LEAST_SEEN)
         expected = self.known["place_m"].numpy()[rows] - np.array(self.pose[:2])
         known &= np.minimum(np.hypot(*expected.T), np.hypot(*vectors.T)) > _NEAR_M
         if not known.any():
@@ -482,7 +391,7 @@ class SemanticCells(Population):
             if theirs["experience"] >= 0:
                 theirs["experience"] = int(join.experiences[theirs["experience"]])
                 turn = float(join.turns_rad[other.known["experience"][row]])
-                theirs["offset_m"] = _rotated(np.array(theirs["offset_m"]), turn).tolist()
+                theirs["offset_m"] = rotated(np.array(theirs["offset_m"]), turn).tolist()
             if at is None:
                 keys[kind, number] = len(columns["kind"])
                 for c, value in (
@@ -529,82 +438,6 @@ class SemanticCells(Population):
         merged.now.heading_rad = wrap_angle(session.now.heading_rad + turn)
         merged.now.told = -1
         return merged.state_dict()
-
-
-def into_frame(pose: np.ndarray, point_m: np.ndarray) -> np.ndarray:
-    """Express a point, ``(2,)``, in the frame of a pose, ``(3,)``.
-
-    Example:
-        >>> into_frame(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0])).round(6).tolist()
-        [2.0, 0.0]
-    """
-    return _rotated(point_m - pose[:2], -pose[2])
-
-
-def from_frame(poses: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """Undo :func:`into_frame`, for many: ``(n, 3)`` and ``(n, 2)``."""
-    return poses[:, :2] + _rotated(points_m, poses[:, 2])
-
-
-def _rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
-    c, s = np.cos(by_rad), np.sin(by_rad)
-    x, y = points_m[..., 0], points_m[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
-
-
-def shared_frames(
-    loaded: State, partial: State, confirm: int = 2, same_m: float = 1.0
-) -> tuple[Pose, Pose] | None:
-    """Say how two semantic maps lie by the named landmarks that both know.
-
-    The largest group of them that one turn and one shift bring together within ``same_m`` is
-    believed.
-
-    Returns:
-        A pose in the partial map's frame, and the same in the loaded one's; ``None`` where fewer
-        than ``confirm`` agree, or no more than those that do not.
-    """
-    tables = [
-        {
-            (kind, number): place
-            for kind, number, seen, place in zip(
-                *(state[f"known.{c}"].tolist() for c in ("kind", "number", "seen", "place_m")),
-                strict=True,
-            )
-            if kind == NAMED and seen >= _LEAST_SEEN
-        }
-        for state in (loaded, partial)
-    ]
-    both = sorted(tables[0].keys() & tables[1].keys())
-    if len(both) < max(confirm, 2):
-        return None
-    onto, start = (np.array([table[key] for key in both]) for table in tables)
-    best = None
-    for i, j in combinations(range(len(both)), 2):
-        if np.linalg.norm(start[i] - start[j]) < same_m:
-            continue
-        fit = _laid(start[[i, j]], onto[[i, j]])
-        near = np.linalg.norm(fit(start) - onto, axis=1) <= same_m
-        if best is None or near.sum() > best.sum():
-            best = near
-    if best is None or best.sum() < confirm or 2 * best.sum() <= len(both):
-        return None
-    turn = _turn_between(start[best], onto[best])
-    return Pose(*start[best].mean(0).tolist(), 0.0), Pose(*onto[best].mean(0).tolist(), turn)
-
-
-def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:
-    """Turn of one set of points that fits it best to another, least squares."""
-    a, b = start_m - start_m.mean(0), onto_m - onto_m.mean(0)
-    across = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return math.atan2(across.sum(), (a * b).sum())
-
-
-def _laid(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    turn = _turn_between(start_m, onto_m)
-    c, s = math.cos(turn), math.sin(turn)
-    way = np.array([[c, s], [-s, c]])
-    return lambda points: (points - start_m.mean(0)) @ way + onto_m.mean(0)
 
 
 def _same_nameless(one: SemanticCells, place_m: np.ndarray, free: int) -> tuple[int, int]:

@@ -1,0 +1,88 @@
+"""How the frames lie in which places of landmarks are told: of experiences, of two sessions."""
+
+import math
+from collections.abc import Callable
+from itertools import combinations
+
+import numpy as np
+
+from neuroslam.population import State
+from neuroslam.spiking.sightings import LEAST_SEEN, NAMED
+from neuroslam.types import Pose
+
+
+def into_frame(pose: np.ndarray, point_m: np.ndarray) -> np.ndarray:
+    """Express a point, ``(2,)``, in the frame of a pose, ``(3,)``.
+
+    Example:
+        >>> into_frame(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0])).round(6).tolist()
+        [2.0, 0.0]
+    """
+    return rotated(point_m - pose[:2], -pose[2])
+
+
+def from_frame(poses: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    """Undo :func:`into_frame`, for many: ``(n, 3)`` and ``(n, 2)``."""
+    return poses[:, :2] + rotated(points_m, poses[:, 2])
+
+
+def rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
+    """Turn points about the origin, ``(..., 2)``."""
+    c, s = np.cos(by_rad), np.sin(by_rad)
+    x, y = points_m[..., 0], points_m[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def shared_frames(
+    loaded: State, partial: State, confirm: int = 2, same_m: float = 1.0
+) -> tuple[Pose, Pose] | None:
+    """Say how two semantic maps lie by the named landmarks that both know.
+
+    The largest group of them that one turn and one shift bring together within ``same_m`` is
+    believed.
+
+    Returns:
+        A pose in the partial map's frame, and the same in the loaded one's; ``None`` where fewer
+        than ``confirm`` agree, or no more than those that do not.
+    """
+    tables = [
+        {
+            (kind, number): place
+            for kind, number, seen, place in zip(
+                *(state[f"known.{c}"].tolist() for c in ("kind", "number", "seen", "place_m")),
+                strict=True,
+            )
+            if kind == NAMED and seen >= LEAST_SEEN
+        }
+        for state in (loaded, partial)
+    ]
+    both = sorted(tables[0].keys() & tables[1].keys())
+    if len(both) < max(confirm, 2):
+        return None
+    onto, start = (np.array([table[key] for key in both]) for table in tables)
+    best = None
+    for i, j in combinations(range(len(both)), 2):
+        if np.linalg.norm(start[i] - start[j]) < same_m:
+            continue
+        fit = _laid(start[[i, j]], onto[[i, j]])
+        near = np.linalg.norm(fit(start) - onto, axis=1) <= same_m
+        if best is None or near.sum() > best.sum():
+            best = near
+    if best is None or best.sum() < confirm or 2 * best.sum() <= len(both):
+        return None
+    turn = _turn_between(start[best], onto[best])
+    return Pose(*start[best].mean(0).tolist(), 0.0), Pose(*onto[best].mean(0).tolist(), turn)
+
+
+def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:
+    """Turn of one set of points that fits it best to another, least squares."""
+    a, b = start_m - start_m.mean(0), onto_m - onto_m.mean(0)
+    across = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return math.atan2(across.sum(), (a * b).sum())
+
+
+def _laid(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    turn = _turn_between(start_m, onto_m)
+    c, s = math.cos(turn), math.sin(turn)
+    way = np.array([[c, s], [-s, c]])
+    return lambda points: (points - start_m.mean(0)) @ way + onto_m.mean(0)
