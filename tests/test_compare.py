@@ -5,7 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from neuroslam.experiments.compare import LOSSES, METHODS, compare, config_of, live
+from neuroslam.experiments.compare import (
+    LANDMARKS,
+    LOSSES,
+    METHODS,
+    compare,
+    config_of,
+    live,
+    pixel_landmarks,
+)
 from neuroslam.sensors import open_source
 
 
@@ -71,3 +79,9 @@ def test_what_a_world_can_lose_is_lost(loss):
         assert jump > 5.0
         assert source.odometry()[1000, 0] == pytest.approx(source.odometry()[998, 0], rel=1e-6)
     assert before.image.max() > 0
+
+
+def test_markers_in_pictures_serve_as_landmarks_that_a_sensor_tells(tmp_path):
+    rows = pixel_landmarks(None, tmp_path, seeds=[0], laps=0.15)["rows"]
+    assert {row["landmarks"] for row in rows} == set(LANDMARKS)
+    assert all(0.0 <= row["ate_m"] < 0.5 for row in rows)

@@ -118,6 +118,16 @@ def test_a_landmark_that_most_others_contradict_is_not_learnt():
     assert math.hypot(*cells.pose[:2]) < 0.02
 
 
+@pytest.mark.parametrize("follows", ["nothing", "map"])
+def test_a_landmark_that_was_first_seen_where_it_is_not_is_found_where_it_is(follows):
+    cells = SemanticCells(SemanticConfig(), follows=follows)
+    guide = Guide(Pose(0.0, 0.0, 0.0), 0.0, 0, np.zeros((1, 3))) if follows == "map" else None
+    cells.live(Motion(0.0, 0.0, 0.1), seen((5, 6.0, 2.0)), guide=guide)
+    for _ in range(30):
+        cells.live(Motion(0.0, 0.0, 0.1), seen((5, 2.0, 0.0)), guide=guide)
+    np.testing.assert_allclose(cells.landmarks()["place_m"], [[2.0, 0.0]], atol=0.05)
+
+
 def test_landmarks_without_names_are_told_apart_by_their_places():
     cells = SemanticCells(SemanticConfig())
     ring = [(-1, 3.0, 2.0 * math.pi * k / 5) for k in range(5)]

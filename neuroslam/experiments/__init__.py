@@ -18,6 +18,7 @@ EXPERIMENTS = {
     "campus": (_SESSIONS, "campus", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
     "compare": ("neuroslam.experiments.compare", "compare", None),
+    "pixel-landmarks": ("neuroslam.experiments.compare", "pixel_landmarks", None),
     "boundary-scenarios": (
         "neuroslam.experiments.boundary_cells",
         "boundary_scenarios",

@@ -50,6 +50,17 @@ LOSSES = {
     "ranges gone for 60 s": "blind=70-130",
     "carried half a lap": "carried=100:0.5",
 }
+_MARKED = "world:corridor?noise=0.05&compass_deg=3&markers=12&width=320&height=160"
+LANDMARKS = {
+    "true": ("landmark_reach=6&landmark_noise=0", ["given"]),
+    "with noise": ("landmark_reach=6", ["given"]),
+    "with noise, 10 % elsewhere": ("landmark_reach=6&outliers=0.1", ["given"]),
+    "with noise, without names": ("landmark_reach=6&labels=0", ["given"]),
+    "markers in pictures": ("", ["markers"]),
+    "known views": ("", ["views"]),
+}
+"""Kind of landmarks -> options of the world, and which the brain takes."""
+
 _TESTED = ("RatSLAM", "SLRB", "SSP-SLAM, vectors", "full")
 
 
@@ -123,6 +134,37 @@ def compare(
         save(plot_losses(curves, {name: LOSSES[name] for name in curves}), out / "losses.png")
     results = {"rows": rows, "losses": told}
     write_results(out, results)
+    return results
+
+
+def pixel_landmarks(
+    _data_folder: Path | None, out_folder: Path, seeds: Sequence[int] = (0, 1, 2), laps: float = 4.0
+) -> dict[str, Any]:
+    """Compare landmarks that a sensor tells with such that are found in the pictures.
+
+    Args:
+        _data_folder: It needs none.
+        out_folder: ``results.json`` is written there.
+        seeds: Of the noise; one drive for each.
+        laps: Of each drive.
+
+    Returns:
+        The content of ``results.json``: ``rows``, one for each kind of landmarks and set of cells.
+    """
+    rows = []
+    for kind, (options, landmarks) in LANDMARKS.items():
+        drives = [
+            list(open_source(f"{_MARKED}&laps={laps:g}&seed={seed}&{options}")) for seed in seeds
+        ]
+        for cells in ("semantic", "pose+semantic"):
+            if kind == "known views" and cells == "semantic":
+                continue  # who knows views has pose cells
+            over = {"cells": cells, "semantic": {"landmarks": landmarks}}
+            config = build_config(merge_values(read_preset("full"), over), kind)
+            ates = [live(config, frames).ate_m for frames in drives]
+            rows.append(_row("corridor", cells, ates, landmarks=kind))
+    results = {"rows": rows}
+    write_results(Path(out_folder), results)
     return results
 
 

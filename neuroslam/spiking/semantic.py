@@ -21,6 +21,8 @@ from neuroslam.types import Motion, Pose
 
 _KINDS = ("landmark", "view", "nameless")
 _KNOWN = 0.5  # strength of a recall from which a landmark is known
+_CLEAR = 0.7  # of its strength, that a recall is like the place that is read from it
+_STEPS = 3  # of Newton's method, from where a landmark is seen to where it is recalled
 _CONSENSUS = 3  # known landmarks in sight, from which on they can outvote one
 _MOVED_M = 0.05  # by which a landmark moves with its experience before memory is rewritten
 _NEAR_M = 0.5  # nearer landmarks say nothing of the heading
@@ -159,7 +161,8 @@ class SemanticCells(Population):
             now.told = -1
             return Told((0.0, 0.0), 0.0, None, 0.0, -1, False, False)
         if strength > _KNOWN:
-            self._note_place(attended, guide)
+            vector = vectors[rows == attended][0]
+            self._note_place(attended, guide, np.array(here) + vector)
         place = None
         if bool(self.slam.familiar[0]) and (now.told != attended or lost):
             now.told = attended
@@ -333,11 +336,19 @@ class SemanticCells(Population):
         )
         return attended, recall, gate, lost and bool(slam.familiar[0])
 
-    def _note_place(self, row: int, guide: Guide | None) -> None:
+    def _note_place(self, row: int, guide: Guide | None, seen_m: np.ndarray) -> None:
         """Read out where the landmark is that is recalled."""
         recalled = torch.view_as_complex(self.slam.recalled)
         start = self.known["place_m"][row][None].to(recalled.real)
-        place = self.decoder.track(recalled, start)[0].double()
+        place = self.decoder.track(recalled, start)
+        clear = _CLEAR * float(recalled.abs().square().mean(-1).sqrt())
+        if float(self.decoder.similarity(recalled, place)) < clear:  # first seen where it is not?
+            again = torch.from_numpy(seen_m)[None].to(start)
+            for _ in range(_STEPS):
+                again = self.decoder.track(recalled, again)
+            if float(self.decoder.similarity(recalled, again)) >= clear:
+                place = again
+        place = place[0].double()
         anchor = int(self.known["experience"][row])
         if anchor >= 0 and self.follows == "map":
             at = guide.poses[anchor]
