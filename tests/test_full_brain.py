@@ -141,6 +141,25 @@ def test_landmarks_without_names_are_told_apart_by_their_places():
     assert set(known["name"]) == {f"nameless_{k}" for k in range(5)}
 
 
+def test_a_landmark_that_two_sensors_tell_counts_once():
+    scanner, camera = (
+        np.array([[7, 2.0, 0.1], [-1, 1.0, 0.0]]),
+        np.array([[7, 2.2, 0.1], [8, 3, 0]]),
+    )
+    both = Sightings.of(scanner, camera)
+    assert sorted(both.number.tolist()) == [-1, 7, 8]
+    assert both.distance_m[both.number == 7].tolist() == [2.0]
+    nameless = np.array([[-1, 1.0, 0.0], [-1, 2.0, 1.0], [-1, 3.0, 2.0]])
+    assert len(Sightings.of(nameless).kind) == 3
+
+
+def test_a_brain_without_cells_for_a_compass_does_not_mind_a_broken_one(drive):
+    broken = [frame._replace(heading_rad=math.nan) for frame in drive[:3]]
+    assert lives(brain_of("pose"), broken).clock.frames_seen == 3
+    with pytest.raises(BadFrame, match="heading nan"):
+        brain_of("pose+semantic")(broken[0])
+
+
 def test_what_was_seen_once_is_no_landmark():
     cells, ring = taught()
     cells.live(Motion(0.0, 0.0, 0.1), seen(*ring, (99, 1.0, 0.5)))

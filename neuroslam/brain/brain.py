@@ -207,7 +207,8 @@ class NavigationBrain(nn.Module):
         config, image = self.config, frame.image
         walls = view = None
         landmarks = []
-        if frame.heading_rad is not None and not math.isfinite(frame.heading_rad):
+        compass = config.cells != ("pose",) and frame.heading_rad is not None
+        if compass and not math.isfinite(frame.heading_rad):
             raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
         if config.has("place") and frame.walls is not None:
             check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))

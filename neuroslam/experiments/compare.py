@@ -42,7 +42,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "RatSLAM and SLRB": {"cells": "pose+place"},
     "full": {},
 }
-"""Name -> what differs from the preset ``full``."""
+"""Name -> what differs from the preset ``full``, in which landmarks are only those of a sensor."""
 
 LOSSES = {
     "nothing is lost": "",
@@ -170,7 +170,8 @@ def pixel_landmarks(
 
 def config_of(method: str) -> BrainConfig:
     """Return the config of a method: the preset ``full``, and what differs."""
-    return build_config(merge_values(read_preset("full"), METHODS[method]), method)
+    told = merge_values(read_preset("full"), {"semantic": {"landmarks": ["given"]}})
+    return build_config(merge_values(told, METHODS[method]), method)
 
 
 def live(config: BrainConfig, frames: Sequence[Frame]) -> Life:

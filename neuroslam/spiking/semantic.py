@@ -160,14 +160,14 @@ class SemanticCells(Population):
         if attended < 0:
             now.told = -1
             return Told((0.0, 0.0), 0.0, None, 0.0, -1, False, False)
+        vector = vectors[rows == attended][0]
         if strength > _KNOWN:
-            vector = vectors[rows == attended][0]
             self._note_place(attended, guide, np.array(here) + vector)
         place = None
         if bool(self.slam.familiar[0]) and (now.told != attended or lost):
             now.told = attended
-            vector = vectors[rows == attended][0]
             place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
+        lost = lost and self._is_inside(place)
         if lost:  # its landmarks contradict for long: it was carried, or has drifted far
             self.go_to(place)
         correction, turn = (0.0, 0.0), 0.0
@@ -231,12 +231,15 @@ class SemanticCells(Population):
         self.slam.start(torch.tensor([place_m]))
 
     def _stay_inside(self, place_m: tuple[float, float]) -> None:
-        low, high = self.slam.space.bounds_m.T.tolist()
-        if not all(a <= x <= b for a, x, b in zip(low, place_m, high, strict=True)):
+        if not self._is_inside(place_m):
             raise MapError(
                 f"semantic map: the robot is at {place_m[0]:.1f}, {place_m[1]:.1f} m, outside of "
-                f"its space of +-{high[0]:g} m; raise semantic.space.reach_m"
+                f"its space of +-{self.slam.space.bounds_m[0, 1]:g} m; raise semantic.space.reach_m"
             )
+
+    def _is_inside(self, place_m: tuple[float, float]) -> bool:
+        low, high = self.slam.space.bounds_m.T.tolist()
+        return all(a <= x <= b for a, x, b in zip(low, place_m, high, strict=True))
 
     def _name(
         self, seen: Sightings, places_m: np.ndarray, guide: Guide | None

@@ -33,6 +33,8 @@ class Sightings(NamedTuple):
     def of(cls, *tables: np.ndarray) -> "Sightings":
         """Take number, distance and bearing of landmarks, ``(n, 3)`` of each sensor.
 
+        One with a name that several tell is taken from the first of them.
+
         Raises:
             BadFrame: If the rows cannot be that.
 
@@ -49,6 +51,10 @@ class Sightings(NamedTuple):
         rows = np.concatenate((np.empty((0, 3)), *tables))
         if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
             raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
+        first = np.unique(rows[:, 0], return_index=True)[1]
+        once = rows[:, 0] < 0  # nameless ones are told apart by their places
+        once[first] = True
+        rows = rows[once]
         kind = np.where(rows[:, 0] < 0, NAMELESS, NAMED)
         return cls(kind, rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2])
 
