@@ -59,25 +59,49 @@ Confirm = Annotated[
 ]
 
 
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="SOURCE",
+        help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
+        "VIDEO+MOTION.csv, arena:NAME or world:NAME.",
+    ),
+]
+Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
+Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
+]
+Start = Annotated[int, typer.Option(help="First frame.")]
+BadFrame = Annotated[
+    OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(min=1, help="So many at once; 1, or as many as the cluster has processors."),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local to start one"
+    ),
+]
+
+
 @app.command("run")
 def run_command(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-            "VIDEO+MOTION.csv, arena:NAME or world:NAME.",
-        ),
-    ],
+    source: Source,
     out: Out,
-    preset: Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
-    ] = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
-    ] = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
     maps: Annotated[
         list[Path] | None,
         typer.Option(
@@ -88,15 +112,11 @@ def run_command(
         ),
     ] = None,
     confirm: Confirm = None,
-    start: Annotated[int, typer.Option(help="First frame.")] = 0,
+    start: Start = 0,
     stop: Stop = None,
-    on_bad_frame: Annotated[
-        OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
-    ] = OnBadFrame.stop,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
     no_tensorboard: NoTensorboard = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
-    ] = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
     from neuroslam.brain import read_checkpoint
@@ -147,9 +167,7 @@ def merge_command(
     ],
     out: Out,
     confirm: Confirm = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
-    ] = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Merge two finished sessions; exit 0 merged, 3 refused, and then nothing is written."""
     from neuroslam.merging import merge_runs
@@ -162,6 +180,111 @@ def merge_command(
     _print_not_joined(summary)
     console.print(f"Written: {out}")
     return 0
+
+
+@app.command("sweep")
+def sweep_command(
+    sources: Sources,
+    out: Out,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=A,B,C", help="As view.threshold=0.03,0.05; several are allowed."),
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, help="So many runs of each, with other noise and random weights."),
+    ] = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    start: Start = 0,
+    stop: Stop = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Map sources with all values of what is varied; exit 2 if a run failed."""
+    from neuroslam.sweeps import given, sweep
+
+    with _counting("sweep") as on_done:
+        rows = sweep(
+            sources,
+            out,
+            vary=vary or (),
+            seeds=seeds,
+            preset=preset,
+            config=config,
+            assignments=assignments or (),
+            start=start,
+            stop=stop,
+            on_bad_frame=on_bad_frame.value,
+            jobs=jobs,
+            ray=ray,
+            overwrite=overwrite,
+            on_done=lambda done, total: on_done("runs", done, total),
+        )
+    figures = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
+    keys = [*given(rows), *(key for key in figures if any(row.get(key) for row in rows))]
+    console.print(_down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
+    failed = [row for row in rows if row["error"]]
+    for row in failed:
+        _complain("sweep", f"{row['run']}: {row['error']}")
+    console.print(f"Written: {out}")
+    return USER_ERROR if failed else 0
+
+
+@app.command("fleet")
+def fleet_command(
+    sources: Sources,
+    out: Out,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    confirm: Confirm = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Map each SOURCE as a robot's session, merge all; exit 3: some stay apart, 2: one failed."""
+    from neuroslam.fleets import fleet
+    from neuroslam.runs import resolve_config
+
+    if confirm is not None:
+        assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
+    with _counting("fleet") as on_done:
+        report = fleet(
+            sources,
+            out,
+            resolve_config(preset, config, tuple(assignments or ())),
+            preset=preset or "",
+            on_bad_frame=on_bad_frame.value,
+            jobs=jobs,
+            ray=ray,
+            overwrite=overwrite,
+            on_done=on_done,
+        )
+    for row in report.sessions:
+        figures = f"{row['frames']} frames, {row['experiences']} places" if "frames" in row else ""
+        console.print(f"session {row['session']}: {row['source']}: {figures or 'failed'}")
+    for row in report.tree:
+        first, second = ("+".join(map(str, row[name])) for name in ("first", "second"))
+        done = "merged" if row["merged"] else "not merged"
+        console.print(f"level {row['level']}: {first} with {second}: {done}: {row['reason']}")
+    if report.merged:
+        error = report.merged.get("ate_rmse_m")
+        console.print(
+            f"one map of sessions {', '.join(map(str, report.merged['sessions']))}: "
+            f"{report.merged['experiences']} places, {report.merged['links']} links"
+            + ("" if error is None else f"; error against the truth (ATE, rigid) {error:.3f} m")
+        )
+    for part in report.apart:
+        console.print(f"stays apart: sessions {', '.join(map(str, part['sessions']))}")
+    console.print(f"Written: {out}")
+    for row in report.failed:
+        _complain("fleet", f"session {row['session']}: {row['error']}")
+    return USER_ERROR if report.failed else REFUSED if report.apart else 0
 
 
 @app.command("inspect")
@@ -332,6 +455,27 @@ def _shown(value: object) -> str:
         return f"{value:.4g}" if value == value else ""  # NaN is not equal to itself
     text = "; ".join(map(_shown, value)) if isinstance(value, list) else str(value)
     return text.replace("_", " ")
+
+
+@contextmanager
+def _counting(name: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Show how many of several runs are done; yield what tells it."""
+    columns = (
+        TextColumn("{task.description}", style="bold", markup=False),
+        BarColumn(bar_width=24),
+        TextColumn("{task.completed:.0f} of {task.total:.0f}"),
+        TimeElapsedColumn(),
+    )
+    on_screen = console.is_terminal
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=2, disable=not on_screen
+    ) as bar:
+        task = bar.add_task(name, total=1)
+
+        def on_done(what: str, done: int, total: int) -> None:
+            bar.update(task, description=f"{name}: {what}", completed=done, total=total)
+
+        yield on_done
 
 
 @contextmanager

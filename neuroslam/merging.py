@@ -11,6 +11,7 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.brain.matching import find_match
 from neuroslam.brain.merge import MergeReport, merge
 from neuroslam.errors import RunError
+from neuroslam.parallel import one_thread
 from neuroslam.run_files import (
     FRAME_COLUMNS,
     LANDMARKS_FILE,
@@ -20,7 +21,7 @@ from neuroslam.run_files import (
     read_plan,
     require_free,
 )
-from neuroslam.runs import RunSummary, one_thread, write_results
+from neuroslam.runs import RunSummary, write_results
 
 _REST_LOOPS = 5000
 """Most loops in which the merged map is relaxed; a large map goes on relaxing when it is used."""

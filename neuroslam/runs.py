@@ -12,7 +12,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -29,6 +28,7 @@ from neuroslam.config import (
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
+from neuroslam.parallel import one_thread
 from neuroslam.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.review import draw_map
 from neuroslam.run_files import (
@@ -293,26 +293,15 @@ def _and_why(skipped: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def one_thread(n: int) -> Iterator[None]:
-    """One is faster than more for one brain: its arrays are too small to share."""
-    torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(n)
-    cv2.setNumThreads(n)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(torch_threads)
-        cv2.setNumThreads(cv_threads)
-
-
-@contextlib.contextmanager
 def _asked_to_stop() -> Iterator[list[int]]:
     """Let Ctrl-C end the run after the frame in hand, so that no stage is ahead of another.
 
-    A second Ctrl-C interrupts at once. Only the main thread can take signals.
+    A second Ctrl-C interrupts at once. Only the main thread can take signals; and where they are
+    ignored, someone else sees to them.
     """
     asked: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
+    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    if ignored or threading.current_thread() is not threading.main_thread():
         yield asked
         return
 

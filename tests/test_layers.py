@@ -9,13 +9,13 @@ ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 FLOW = [
     "errors", "types", "geometry", "sections", "semantic_sections", "config",
-    "storage", "checked_files", "population", "vision",
+    "storage", "checked_files", "population", "vision", "parallel",
     "sensors", "odometry", "view", "cells", "spiking", "mapping", "brain",
     "evaluation", "drawing", "plotting", "cell_drawing", "place_drawing", "spike_drawing",
     "semantic_drawing", "cell_panels", "semantic_panels",
-    "merge_drawing", "comparison_drawing", "recording", "run_files",
+    "merge_drawing", "comparison_drawing", "sweep_drawing", "recording", "run_files",
     "inspection", "export",
-    "review", "report", "runs", "merging", "demo",
+    "review", "report", "runs", "merging", "sweeps", "fleets", "demo",
     "experiments", "cli",
 ]  # fmt: skip
 SIDE_BY_SIDE = {("odometry", "view"), ("view", "odometry")}

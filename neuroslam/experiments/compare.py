@@ -14,8 +14,8 @@ from neuroslam.config import BrainConfig, build_config, merge_values, read_prese
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.geometry import integrate_velocities
+from neuroslam.parallel import one_thread
 from neuroslam.plotting import save
-from neuroslam.runs import one_thread
 from neuroslam.sensors import open_source
 from neuroslam.types import NO_EXPERIENCE, Frame, Pose
 

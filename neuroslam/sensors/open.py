@@ -97,6 +97,27 @@ def absolute_spec(spec: str) -> str:
     return spec if spec.startswith(_MADE) else str(Path(spec).resolve())
 
 
+def seeded_spec(spec: str, seed: int) -> str:
+    """Return what names the same source with a seed; a recording has none, and stays.
+
+    Raises:
+        SourceError: If it has a seed.
+
+    Example:
+        >>> seeded_spec("world:town?laps=2", 7), seeded_spec("drive.avi", 7)
+        ('world:town?laps=2&seed=7', 'drive.avi')
+    """
+    if parts := _parts(spec):
+        return "+".join(seeded_spec(part, seed) for part in parts)
+    if not spec.startswith(_MADE):
+        return spec
+    name, _, query = spec.partition("?")
+    given = list(filter(None, query.split("&")))
+    if any(option.startswith("seed=") for option in given):
+        raise SourceError(f"{spec}: has a seed already; leave it or the number of seeds out")
+    return f"{name}?{'&'.join([*given, f'seed={seed}'])}"
+
+
 def _parts(spec: str) -> tuple[str, str] | None:
     """Split ``camera+motion``, where no file has that whole name and each part names something."""
     if "+" not in spec or Path(spec).exists():

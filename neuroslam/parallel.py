@@ -1,0 +1,237 @@
+"""Independent pieces of work side by side: in processes of this machine, or on a Ray cluster.
+
+Each piece runs with one thread of torch and OpenCV, wherever it runs: the results are the same.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from types import ModuleType
+from typing import TypeVar
+
+import cv2
+import torch
+
+from neuroslam.errors import NeuroslamError, RunError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def parallel_map(
+    function: Callable[[T], R], items: Sequence[T], jobs: int | None = None, ray: str | None = None
+) -> list[R]:
+    """Return ``[function(item) for item in items]``, worked out side by side.
+
+    Args:
+        function: Of a module, so that another process can import it; it depends on its item alone.
+        items: What it is called with.
+        jobs: So many at once; 1, or with Ray as many as it has processors, if not given.
+        ray: Address of a Ray cluster, or ``local`` to start one here; else processes are started.
+
+    Raises:
+        RunError: If ``jobs`` is below 1, Ray is missing or not to be reached, or a process died.
+        Exception: The first that the function raises; the work that is left is given up.
+
+    Example:
+        >>> parallel_map(abs, [-1, 2, -3])
+        [1, 2, 3]
+    """
+    found: dict[int, R] = {}
+    with contextlib.closing(outcomes(function, items, jobs, ray)) as each:
+        for number, outcome in each:
+            if isinstance(outcome, NeuroslamError):
+                raise outcome
+            found[number] = outcome
+    return [found[number] for number in range(len(items))]
+
+
+def outcomes(
+    function: Callable[[T], R], items: Sequence[T], jobs: int | None = None, ray: str | None = None
+) -> Iterator[tuple[int, R | NeuroslamError]]:
+    """Yield the number of an item and what came of it, as each is done; close it to end the rest.
+
+    Args:
+        function: As for :func:`parallel_map`.
+        items: As for :func:`parallel_map`.
+        jobs: As for :func:`parallel_map`.
+        ray: As for :func:`parallel_map`.
+
+    Yields:
+        The result, or the error of a user's that the function raised, or a :class:`RunError` if its
+        process died; the other items go on.
+
+    Raises:
+        RunError: If ``jobs`` is below 1, Ray is missing or not to be reached.
+
+    Example:
+        >>> list(outcomes(len, ["a", "bc"]))
+        [(0, 1), (1, 2)]
+    """
+    if jobs is not None and jobs < 1:
+        raise RunError(f"jobs is {jobs}; expected 1 or more")
+    numbered = dict(enumerate(items))
+    if not numbered:
+        return
+    if ray is not None:
+        yield from _on_ray(function, numbered, jobs, ray)
+    elif jobs is None or jobs == 1:
+        for number, item in numbered.items():
+            yield number, _attempt(function, item)
+    else:
+        yield from _in_processes(function, numbered, jobs)
+
+
+@contextlib.contextmanager
+def one_thread(n: int = 1) -> Iterator[None]:
+    """One is faster than more for one brain: its arrays are too small to share."""
+    torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(n)
+    cv2.setNumThreads(n)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(torch_threads)
+        cv2.setNumThreads(cv_threads)
+
+
+def _attempt(function: Callable[[T], R], item: T) -> R | NeuroslamError:
+    with one_thread():
+        try:
+            return function(item)
+        except NeuroslamError as error:
+            return error
+
+
+# --- processes of this machine ------------------------------------------------------------------
+
+
+def _in_processes(
+    function: Callable[[T], R], numbered: Mapping[int, T], jobs: int
+) -> Iterator[tuple[int, R | NeuroslamError]]:
+    lost: list[int] = []
+    with _workers(min(jobs, len(numbered))) as pool:
+        futures: dict[Future, int] = {}
+        with _interrupts_ignored():  # what is started here goes on ignoring them: we end it
+            for number, item in numbered.items():
+                try:
+                    futures[pool.submit(_attempt, function, item)] = number
+                except BrokenProcessPool:
+                    lost.append(number)
+        for future in as_completed(futures):
+            try:
+                outcome = future.result()
+            except BrokenProcessPool:
+                lost.append(futures[future])
+            else:
+                yield futures[future], outcome
+    for number in sorted(lost):  # whichever process died, all were ended: each is tried alone
+        if len(numbered) == 1:
+            yield number, _died()
+        else:
+            yield from _in_processes(function, {number: numbered[number]}, 1)
+
+
+@contextlib.contextmanager
+def _workers(n: int) -> Iterator[ProcessPoolExecutor]:
+    """Keep a pool of processes that end at once when this block is left early, or this process."""
+    context = multiprocessing.get_context("spawn")
+    held_there, held_here = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(n, context, _start_worker, (held_there,))
+    try:
+        yield pool
+        pool.shutdown()
+    finally:
+        held_here.close()
+        pool.shutdown(cancel_futures=True)
+        held_there.close()
+
+
+def _start_worker(lifeline: Connection) -> None:
+    """Ignore Ctrl-C, of which the parent knows, and end when the parent lets go of the line."""
+
+    def end_with_parent() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            lifeline.recv()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _died() -> RunError:
+    return RunError(
+        "its process died: out of memory, killed, or started by a script that lacks "
+        "`if __name__ == '__main__':`"
+    )
+
+
+# --- a Ray cluster ------------------------------------------------------------------------------
+
+
+def _on_ray(
+    function: Callable[[T], R], numbered: Mapping[int, T], jobs: int | None, address: str
+) -> Iterator[tuple[int, R | NeuroslamError]]:
+    try:
+        import ray
+    except ImportError as error:
+        raise RunError(
+            f"Ray cannot be imported ({error}); pip install neuroslam[sweep], or leave --ray out"
+        ) from None
+    ours = not ray.is_initialized()
+    if ours:
+        _connect(ray, address, jobs)
+    running: dict[ray.ObjectRef, int] = {}
+    try:
+        task = ray.remote(num_cpus=1, max_retries=0)(_attempt)
+        waiting = deque(numbered.items())
+        while waiting or running:
+            while waiting and (jobs is None or len(running) < jobs):
+                number, item = waiting.popleft()
+                running[task.remote(function, item)] = number
+            (done,), _ = ray.wait(list(running), num_returns=1)
+            number = running.pop(done)
+            try:
+                outcome = ray.get(done)
+            except (ray.exceptions.WorkerCrashedError, ray.exceptions.OutOfMemoryError):
+                outcome = _died()
+            yield number, outcome
+    finally:
+        for one in running:
+            ray.cancel(one, force=True)
+        if ours:
+            ray.shutdown()
+
+
+def _connect(ray: ModuleType, address: str, jobs: int | None) -> None:
+    quiet = {"log_to_driver": False, "logging_level": "error"}
+    try:
+        if address == "local":
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would tell its makers
+            ray.init("local", num_cpus=jobs, include_dashboard=False, **quiet)
+        else:
+            ray.init(address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        line = " ".join(str(error).split())
+        raise RunError(
+            f"--ray {address}: not to be reached ({line}); expected local, auto or HOST:PORT"
+        ) from None

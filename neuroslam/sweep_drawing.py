@@ -1,0 +1,144 @@
+"""The figure of a sweep, errors and counts over what was varied: rows in, a ``Figure`` out."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter
+
+from neuroslam.drawing import CURVES, ODOMETRY, STYLE, counted, new_figure
+
+_PANELS = {
+    "ate_rmse_m": "absolute trajectory error (m)",
+    "templates": "templates",
+    "experiences": "experiences",
+    "loop_closures": "loop closures",
+    "place_cells": "place cells",
+}
+_DASHES = ("-", "--", ":", "-.")
+_APART = 4.0  # largest value over the smallest from which a logarithmic axis is easier to read
+
+
+def plot_sweep(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> Figure:
+    """Draw errors and counts of runs over what was varied first; a line for each of the rest.
+
+    Lines go through means over seeds, dots are single runs. Runs that failed are left out.
+
+    Args:
+        rows: Of :func:`neuroslam.sweeps.sweep`.
+        varied: Keys of what was varied, of which ``source`` may be one; the seed is none.
+
+    Raises:
+        ValueError: If no run went well.
+    """
+    done = [row for row in rows if "experiences" in row]
+    if not done:
+        raise ValueError(f"plot_sweep: got {len(rows)} rows, none of a run that went well")
+    keys = [key for key in varied if len({str(row[key]) for row in rows}) > 1]
+    across = next((key for key in keys if key != "source"), "source")
+    rest = [key for key in keys if key != across]
+    places, labels = _places([row[across] for row in rows])
+    lines: dict[str, list[Mapping[str, Any]]] = {}
+    for row in done:
+        lines.setdefault(", ".join(_named(key, row[key]) for key in rest), []).append(row)
+    panels = [key for key in _PANELS if any(row.get(key) for row in done)] or ["experiences"]
+    columns = len(panels) if len(panels) < 4 else 2
+    with mpl.rc_context(STYLE):
+        wide = max(6.0, 4.4 * columns)
+        title = f"{across.rpartition('.')[2].replace('_', ' ')} varied: "
+        title += counted(len(done), "run")
+        if len(done) < len(rows):
+            title += f", {len(rows) - len(done)} failed"
+        high = 3.0 * -(-len(panels) // columns) + 0.9 + 0.22 * len(lines) / columns
+        figure = new_figure(wide, high, title)
+        every = figure.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
+        for axes, key in zip(every, panels, strict=False):
+            if key == "ate_rmse_m":
+                _draw_line(axes, done, across, places, "odometry_ate_rmse_m", ODOMETRY, "-", 1.2)
+            for number, group in enumerate(lines.values()):
+                colour = CURVES[number % len(CURVES)]
+                dash = _DASHES[number // len(CURVES) % len(_DASHES)]
+                _draw_line(axes, group, across, places, key, colour, dash, 1.8)
+            axes.set(ylabel=_PANELS[key], xlabel=across, ylim=(0.0, None))
+            axes.yaxis.set_major_locator(MaxNLocator(6, integer=key != "ate_rmse_m"))
+            _number(axes, places, labels)
+        for axes in every[len(panels) :]:
+            axes.set_axis_off()
+        key = _key(list(lines), "ate_rmse_m" in panels)
+        if len(key) > 1:
+            width = sum(0.075 * len(line.get_label()) + 0.6 for line in key)
+            ncols = max(1, min(len(key), int(len(key) * wide / width)))
+            figure.legend(handles=key, loc="outside lower center", ncols=ncols)
+    return figure
+
+
+def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[str] | None]:
+    """Say where each value lies across, and what is written there if they are no numbers."""
+    distinct = {str(value): value for value in values}
+    numbers = [isinstance(v, int | float) and not isinstance(v, bool) for v in distinct.values()]
+    if all(numbers):
+        return {text: float(value) for text, value in distinct.items()}, None
+    return {text: float(k) for k, text in enumerate(distinct)}, list(distinct)
+
+
+def _number(axes: Axes, places: Mapping[str, float], labels: list[str] | None) -> None:
+    if labels is not None:
+        shown = [textwrap.shorten(Path(label).name, 60, placeholder=" …") for label in labels]
+        shown = [textwrap.fill(label, 22, break_on_hyphens=False) for label in shown]
+        crowded = max(map(len, shown)) * len(shown) > 40
+        axes.set_xticks(range(len(shown)), shown, rotation=20 if crowded else 0,
+                        ha="right" if crowded else "center")  # fmt: skip
+        axes.set_xlim(-0.5, len(labels) - 0.5)
+        return
+    ticks = sorted(places.values())
+    if ticks[0] > 0 and ticks[-1] / ticks[0] >= _APART:
+        axes.set_xscale("log")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.set_minor_locator(FixedLocator([]))
+    if len(ticks) <= 8:
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+
+
+def _draw_line(
+    axes: Axes,
+    rows: Sequence[Mapping[str, Any]],
+    across: str,
+    places: Mapping[str, float],
+    key: str,
+    colour: str,
+    dash: str,
+    width: float,
+) -> None:
+    found: dict[float, list[float]] = {}
+    for row in rows:
+        if key in row:
+            found.setdefault(places[str(row[across])], []).append(row[key])
+    where = sorted(found)
+    axes.plot(where, [np.mean(found[x]) for x in where], dash, color=colour, lw=width, zorder=3)
+    axes.plot(
+        [x for x in where for _ in found[x]], [y for x in where for y in found[x]],
+        "o", color=colour, ms=4, alpha=0.75, mew=0, zorder=4,
+    )  # fmt: skip
+
+
+def _key(names: Sequence[str], odometry: bool) -> list[Line2D]:
+    key = [
+        Line2D([], [], color=CURVES[k % len(CURVES)], ls=_DASHES[k // len(CURVES) % len(_DASHES)],
+               lw=1.8, marker="o", ms=4, label=textwrap.shorten(name or "map", 80))
+        for k, name in enumerate(names)
+    ]  # fmt: skip
+    if odometry:
+        key.append(Line2D([], [], color=ODOMETRY, marker="o", ms=4, label="odometry alone"))
+    return key
+
+
+def _named(key: str, value: object) -> str:
+    if key == "source":
+        return Path(str(value)).name
+    return f"{key.rpartition('.')[2].replace('_', ' ')} {value}"
