@@ -418,11 +418,13 @@ def experiment_command(
         Path | None,
         typer.Option(help="Folder that holds the recordings, where the experiment needs some."),
     ] = None,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
 ) -> int:
     """Repeat an experiment of a paper."""
     from neuroslam.experiments import run_experiment
 
-    rows = run_experiment(name, data, out)
+    rows = run_experiment(name, data, out, jobs, ray)
     few = len({key for row in rows for key in row}) <= 9
     for table in [_down(rows, name)] if few else _across(rows, name):
         console.print(table)

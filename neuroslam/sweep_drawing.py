@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -48,34 +48,54 @@ def plot_sweep(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> Figu
     for row in done:
         lines.setdefault(", ".join(_named(key, row[key]) for key in rest), []).append(row)
     panels = [key for key in _PANELS if any(row.get(key) for row in done)] or ["experiences"]
-    columns = len(panels) if len(panels) < 4 else 2
+    columns = 2 if len(panels) in (2, 4) else min(3, len(panels))
+    down = -(-len(panels) // columns)
+    title = f"{', '.join(keys) or 'seed'} varied: {counted(len(done), 'run')}"
+    if len(done) < len(rows):
+        title += f", {len(rows) - len(done)} failed"
     with mpl.rc_context(STYLE):
         wide = max(6.0, 4.4 * columns)
-        title = f"{across.rpartition('.')[2].replace('_', ' ')} varied: "
-        title += counted(len(done), "run")
-        if len(done) < len(rows):
-            title += f", {len(rows) - len(done)} failed"
-        high = 3.0 * -(-len(panels) // columns) + 0.9 + 0.22 * len(lines) / columns
-        figure = new_figure(wide, high, title)
-        every = figure.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
+        figure = new_figure(wide, 3.0 * down + 0.9, title)
+        every = figure.subplots(down, columns, squeeze=False).ravel()
         for axes, key in zip(every, panels, strict=False):
             if key == "ate_rmse_m":
-                _draw_line(axes, done, across, places, "odometry_ate_rmse_m", ODOMETRY, "-", 1.2)
+                odometry = _Line(done, "odometry_ate_rmse_m", ODOMETRY, "-", 1.2, 0.0, 0.4)
+                _draw(axes, odometry, across, places, labels is None)
             for number, group in enumerate(lines.values()):
-                colour = CURVES[number % len(CURVES)]
-                dash = _DASHES[number // len(CURVES) % len(_DASHES)]
-                _draw_line(axes, group, across, places, key, colour, dash, 1.8)
-            axes.set(ylabel=_PANELS[key], xlabel=across, ylim=(0.0, None))
+                aside = (number + 1) / (len(lines) + 1) - 0.5
+                colour, dash = _look(number)
+                # Earlier lines are wider: where several lie on each other, all are seen.
+                lw = 1.6 + 1.4 * min(4, len(lines) - 1 - number) * (labels is None)
+                line = _Line(group, key, colour, dash, lw, aside, 0.35 / (len(lines) + 1))
+                _draw(axes, line, across, places, labels is None)
+            axes.set(
+                ylabel=_PANELS[key], xlabel=across, ylim=(0.0, max(1.06 * axes.get_ylim()[1], 1e-3))
+            )
             axes.yaxis.set_major_locator(MaxNLocator(6, integer=key != "ate_rmse_m"))
             _number(axes, places, labels)
         for axes in every[len(panels) :]:
             axes.set_axis_off()
         key = _key(list(lines), "ate_rmse_m" in panels)
         if len(key) > 1:
-            width = sum(0.075 * len(line.get_label()) + 0.6 for line in key)
-            ncols = max(1, min(len(key), int(len(key) * wide / width)))
+            longest = max(0.075 * len(line.get_label()) + 0.6 for line in key)
+            ncols = max(1, min(len(key), int(wide / longest)))
             figure.legend(handles=key, loc="outside lower center", ncols=ncols)
+            figure.set_figheight(figure.get_figheight() + 0.2 * -(-len(key) // ncols))
     return figure
+
+
+class _Line(NamedTuple):
+    rows: Sequence[Mapping[str, Any]]
+    key: str
+    colour: str
+    dash: str
+    width: float
+    aside: float  # of its place across, where places are names, from -0.5 to 0.5
+    half: float  # of the width of a mean there
+
+
+def _look(number: int) -> tuple[str, str]:
+    return CURVES[number % len(CURVES)], _DASHES[number // len(CURVES) % len(_DASHES)]
 
 
 def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[str] | None]:
@@ -105,34 +125,35 @@ def _number(axes: Axes, places: Mapping[str, float], labels: list[str] | None) -
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
 
 
-def _draw_line(
-    axes: Axes,
-    rows: Sequence[Mapping[str, Any]],
-    across: str,
-    places: Mapping[str, float],
-    key: str,
-    colour: str,
-    dash: str,
-    width: float,
-) -> None:
+def _draw(axes: Axes, line: _Line, across: str, places: Mapping[str, float], numbers: bool) -> None:
+    """Draw the mean at each place, joined where places are numbers, and a dot for each run."""
     found: dict[float, list[float]] = {}
-    for row in rows:
-        if key in row:
-            found.setdefault(places[str(row[across])], []).append(row[key])
+    for row in line.rows:
+        if line.key in row:
+            found.setdefault(places[str(row[across])], []).append(row[line.key])
     where = sorted(found)
-    axes.plot(where, [np.mean(found[x]) for x in where], dash, color=colour, lw=width, zorder=3)
+    means = [float(np.mean(found[x])) for x in where]
+    look = {"color": line.colour, "lw": line.width, "zorder": 3}
+    if numbers:
+        axes.plot(where, means, line.dash, **look)
+    else:
+        for x, mean in zip(where, means, strict=True):
+            axes.plot(
+                [x + line.aside - line.half, x + line.aside + line.half], [mean, mean], **look
+            )
+    aside = 0.0 if numbers else line.aside
     axes.plot(
-        [x for x in where for _ in found[x]], [y for x in where for y in found[x]],
-        "o", color=colour, ms=4, alpha=0.75, mew=0, zorder=4,
+        [x + aside for x in where for _ in found[x]], [y for x in where for y in found[x]],
+        "o", color=line.colour, ms=3 + line.width, alpha=0.75, mew=0, zorder=3,
     )  # fmt: skip
 
 
 def _key(names: Sequence[str], odometry: bool) -> list[Line2D]:
-    key = [
-        Line2D([], [], color=CURVES[k % len(CURVES)], ls=_DASHES[k // len(CURVES) % len(_DASHES)],
-               lw=1.8, marker="o", ms=4, label=textwrap.shorten(name or "map", 80))
-        for k, name in enumerate(names)
-    ]  # fmt: skip
+    key = []
+    for number, name in enumerate(names):
+        colour, dash = _look(number)
+        label = textwrap.shorten(name or "map", 80, placeholder=" …")
+        key.append(Line2D([], [], color=colour, ls=dash, lw=1.8, marker="o", ms=4, label=label))
     if odometry:
         key.append(Line2D([], [], color=ODOMETRY, marker="o", ms=4, label="odometry alone"))
     return key

@@ -1,6 +1,7 @@
 """Experiments of the papers: each writes ``results.json`` and its figures into a folder."""
 
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -40,16 +41,21 @@ _IF_THERE = {"ssp-localisation": "ssp"}
 """Name -> folder of recordings that are used if they are there; else random ones like them."""
 
 
-def run_experiment(name: str, data: Path | None, out: Path) -> list[dict[str, Any]]:
+def run_experiment(
+    name: str, data: Path | None, out: Path, jobs: int | None = None, ray: str | None = None
+) -> list[dict[str, Any]]:
     """Run an experiment; returns its rows, with named, unit-carrying keys.
 
     Args:
         name: One of ``EXPERIMENTS``.
         data: Folder that holds the folders of the recordings; ``None`` if it needs none.
         out: Folder to write.
+        jobs: As for :func:`neuroslam.parallel.parallel_map`, where it has independent lives.
+        ray: The same.
 
     Raises:
-        RunError: If there is no such experiment, or its recording is not there.
+        RunError: If there is no such experiment, its recording is not there, or it has no
+            independent lives that ``jobs`` or ``ray`` could be used for.
     """
     if name not in EXPERIMENTS:
         raise RunError(f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}")
@@ -64,5 +70,10 @@ def run_experiment(name: str, data: Path | None, out: Path) -> list[dict[str, An
         recordings = Path(data) / folder
         if not recordings.is_dir():
             raise RunError(f"{recordings}: no such recording; say where with --data")
-    result = getattr(import_module(module), function)(recordings, Path(out))
+    experiment, side_by_side = getattr(import_module(module), function), {}
+    if jobs is not None or ray is not None:
+        if "jobs" not in signature(experiment).parameters:
+            raise RunError(f"{name}: its lives depend on each other; leave --jobs and --ray out")
+        side_by_side = {"jobs": jobs, "ray": ray}
+    result = experiment(recordings, Path(out), **side_by_side)
     return result["rows"]

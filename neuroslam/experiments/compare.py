@@ -1,7 +1,8 @@
 """All methods side by side: one world, one noise, one seed, and the same frames for each."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from neuroslam.config import BrainConfig, build_config, merge_values, read_prese
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.geometry import integrate_velocities
-from neuroslam.parallel import one_thread
+from neuroslam.parallel import one_thread, parallel_map
 from neuroslam.plotting import save
 from neuroslam.sensors import open_source
 from neuroslam.types import NO_EXPERIENCE, Frame, Pose
@@ -85,6 +86,25 @@ class Life(NamedTuple):
         return float(np.sqrt(np.mean(self.error_m**2)))
 
 
+class Drive(NamedTuple):
+    """Frames that several brains take in.
+
+    Attributes:
+        source: Where they are from.
+        configs: Of the brains, by name.
+    """
+
+    source: str
+    configs: Mapping[str, BrainConfig]
+
+
+def drive(what: Drive) -> tuple[float, dict[str, Life]]:
+    """Let brains take in the same frames; returns the error of odometry alone too, RMS in m."""
+    frames = list(open_source(what.source))
+    lives = {name: live(config, frames) for name, config in what.configs.items()}
+    return _rms(_off(_reckoned(frames), frames)), lives
+
+
 def compare(
     _data_folder: Path | None,
     out_folder: Path,
@@ -93,6 +113,8 @@ def compare(
     laps: float = 4.0,
     methods: Sequence[str] = tuple(METHODS),
     losses: Sequence[str] = tuple(LOSSES),
+    jobs: int | None = None,
+    ray: str | None = None,
 ) -> dict[str, Any]:
     """Compare all methods in rendered worlds, and what is left of each when a sense is lost.
 
@@ -104,21 +126,25 @@ def compare(
         laps: Of each drive; drives that lose a sense are six laps of the first world.
         methods: Of ``METHODS``.
         losses: Of ``LOSSES``.
+        jobs: As for :func:`neuroslam.parallel.parallel_map`: drives side by side.
+        ray: The same.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each world and method, and ``losses``.
     """
     out = Path(out_folder)
     rows: list[dict[str, Any]] = []
+    configs = {name: config_of(name) for name in methods}
+    drives = [
+        Drive(f"world:{world}?{SENSES}&laps={laps:g}&seed={seed}", configs)
+        for world in worlds
+        for seed in seeds
+    ]
+    driven = iter(parallel_map(drive, drives, jobs, ray))
     for world in worlds:
-        lives: dict[str, list[Life]] = {name: [] for name in methods}
-        alone = []
-        for seed in seeds:
-            frames = list(open_source(f"world:{world}?{SENSES}&laps={laps:g}&seed={seed}"))
-            alone.append(_rms(_off(_reckoned(frames), frames)))
-            for name in methods:
-                lives[name].append(live(config_of(name), frames))
-        rows.append(_row(world, "odometry alone", alone))
+        alone, told = zip(*islice(driven, len(seeds)), strict=True)
+        lives = {name: [of[name] for of in told] for name in methods}
+        rows.append(_row(world, "odometry alone", list(alone)))
         rows += [
             _row(
                 world, name, [life.ate_m for life in each],
@@ -128,17 +154,31 @@ def compare(
             )
             for name, each in lives.items()
         ]  # fmt: skip
-    told, curves = _lose(worlds[0], seeds[0], losses, [m for m in _TESTED if m in methods])
+    tested = {name: configs[name] for name in _TESTED if name in methods}
+    drives = [
+        Drive(f"world:{worlds[0]}?{SENSES}&laps=6&seed={seeds[0]}&{LOSSES[loss]}", tested)
+        for loss in losses
+    ]
+    lost = dict(zip(losses, parallel_map(drive, drives, jobs, ray), strict=True))
+    curves = {
+        loss: {name: life.error_m for name, life in each.items()}
+        for loss, (_, each) in lost.items()
+    }
     save(plot_comparison(rows), out / "comparison.png")
     if curves:
         save(plot_losses(curves, {name: LOSSES[name] for name in curves}), out / "losses.png")
-    results = {"rows": rows, "losses": told}
+    results = {"rows": rows, "losses": _lost(curves)}
     write_results(out, results)
     return results
 
 
 def pixel_landmarks(
-    _data_folder: Path | None, out_folder: Path, seeds: Sequence[int] = (0, 1, 2), laps: float = 4.0
+    _data_folder: Path | None,
+    out_folder: Path,
+    seeds: Sequence[int] = (0, 1, 2),
+    laps: float = 4.0,
+    jobs: int | None = None,
+    ray: str | None = None,
 ) -> dict[str, Any]:
     """Compare landmarks that a sensor tells with such that are found in the pictures.
 
@@ -147,22 +187,29 @@ def pixel_landmarks(
         out_folder: ``results.json`` is written there.
         seeds: Of the noise; one drive for each.
         laps: Of each drive.
+        jobs: As for :func:`neuroslam.parallel.parallel_map`: drives side by side.
+        ray: The same.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each kind of landmarks and set of cells.
     """
-    rows = []
+    rows, drives = [], []
     for kind, (options, landmarks) in LANDMARKS.items():
-        drives = [
-            list(open_source(f"{_MARKED}&laps={laps:g}&seed={seed}&{options}")) for seed in seeds
+        # Who knows views has pose cells.
+        some = ("pose+semantic",) if kind == "known views" else ("semantic", "pose+semantic")
+        over = {"semantic": {"landmarks": landmarks}}
+        full = merge_values(read_preset("full"), over)
+        configs = {cells: build_config(full | {"cells": cells}, kind) for cells in some}
+        drives += [
+            Drive(f"{_MARKED}&laps={laps:g}&seed={seed}&{options}", configs) for seed in seeds
         ]
-        for cells in ("semantic", "pose+semantic"):
-            if kind == "known views" and cells == "semantic":
-                continue  # who knows views has pose cells
-            over = {"cells": cells, "semantic": {"landmarks": landmarks}}
-            config = build_config(merge_values(read_preset("full"), over), kind)
-            ates = [live(config, frames).ate_m for frames in drives]
-            rows.append(_row("corridor", cells, ates, landmarks=kind))
+    driven = iter(parallel_map(drive, drives, jobs, ray))
+    for kind in LANDMARKS:
+        told = [lives for _, lives in islice(driven, len(seeds))]
+        rows += [
+            _row("corridor", cells, [lives[cells].ate_m for lives in told], landmarks=kind)
+            for cells in told[0]
+        ]
     results = {"rows": rows}
     write_results(Path(out_folder), results)
     return results
@@ -218,25 +265,16 @@ def _row(world: str, method: str, ates: list[float], **more: float) -> dict[str,
     }
 
 
-def _lose(
-    world: str, seed: int, losses: Sequence[str], methods: Sequence[str]
-) -> tuple[list[dict[str, Any]], dict[str, dict[str, np.ndarray]]]:
-    """Drive six laps without a sense for a while: the error over time, and in the last lap."""
-    rows, curves = [], {}
-    for loss in losses:
-        source = open_source(f"world:{world}?{SENSES}&laps=6&seed={seed}&{LOSSES[loss]}")
-        frames, lap = list(source), source.frames_per_lap
-        curves[loss] = {}
-        for method in methods:
-            life = live(config_of(method), frames)
-            curves[loss][method] = life.error_m
-            rows.append(
-                {
-                    "loss": loss,
-                    "method": method,
-                    "ate_m": life.ate_m,
-                    "largest_error_m": float(life.error_m.max()),
-                    "ate_last_lap_m": _rms(life.error_m[-lap:]),
-                }
-            )
-    return rows, curves
+def _lost(curves: dict[str, dict[str, np.ndarray]]) -> list[dict[str, Any]]:
+    """Say how large errors of drives of six laps were, and in the last lap."""
+    return [
+        {
+            "loss": loss,
+            "method": method,
+            "ate_m": _rms(error_m),
+            "largest_error_m": float(error_m.max()),
+            "ate_last_lap_m": _rms(error_m[-(len(error_m) // 6) :]),
+        }
+        for loss, each in curves.items()
+        for method, error_m in each.items()
+    ]

@@ -19,6 +19,7 @@ Paper: SLRB, Figs. 7, 8, 9, 12 and 13; it gives 0.031 m on the Hafting track aft
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from neuroslam.experiments.place_lives import (
     TrackResult,
     run_track,
 )
+from neuroslam.parallel import parallel_map
 from neuroslam.place_drawing import (
     PathTold,
     PlaceMap,
@@ -188,6 +190,8 @@ def place_map(
     tracks: Sequence[str] = tuple(TRACKS),
     minutes: float = 30.0,
     seeds: Sequence[int] = range(10),
+    jobs: int | None = None,
+    ray: str | None = None,
 ) -> dict[str, Any]:
     """Map places of five tracks with and without walls, and with pose cells (Figs. 8, 9, 12, 13).
 
@@ -197,16 +201,16 @@ def place_map(
         tracks: Which of them.
         minutes: How long; Sargolini's rat at most its 20 min.
         seeds: Of the noise; one life each.
+        jobs: As for :func:`neuroslam.parallel.parallel_map`: tracks side by side.
+        ray: The same; the folders are on a disk that all machines share.
 
     Returns:
         The content of ``results.json``: ``rows`` in short, ``details`` with standard deviations
         over seeds and the responses, ``checks`` of what was aimed at, the ``paper``'s figures.
     """
-    out, told = Path(out_folder), []
-    for name in tracks:
-        result = run_track(Path(data_folder), name, minutes, seeds)
-        draw_track(result, out)
-        told += result.told
+    out = Path(out_folder).resolve()
+    tell = partial(_told, Path(data_folder).resolve(), out, minutes, seeds)
+    told = [one for each in parallel_map(tell, tracks, jobs, ray) for one in each]
     details = summarise(told)
     _draw_errors(told, out)
     return _write(
@@ -221,6 +225,12 @@ def place_map(
             "seeds": len(seeds),
         },
     )
+
+
+def _told(data: Path, out: Path, minutes: float, seeds: Sequence[int], name: str) -> list[Told]:
+    result = run_track(data, name, minutes, seeds)
+    draw_track(result, out)
+    return result.told
 
 
 def _write(out: Path, results: dict[str, Any]) -> dict[str, Any]:
