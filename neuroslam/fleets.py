@@ -293,6 +293,10 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
     if stages:
         stages.sort(key=lambda stage: not stage[0])
         title = f"A fleet of {len(report.sessions)}"
+        if report.merged:
+            title += f": {len(most.sessions)} sessions on one map"
+        title += f", {len(report.apart)} apart" if report.apart else ""
+        title += f", {len(report.failed)} failed" if report.failed else ""
         if len(report.sessions) > len(SESSIONS):
             title += f"; colours repeat after {len(SESSIONS)} sessions"
         save(plot_stages([stage for _, stage in stages], title), out / "fleet.png")

@@ -119,7 +119,7 @@ def _in_processes(
     lost: list[int] = []
     with _workers(min(jobs, len(numbered))) as pool:
         futures: dict[Future, int] = {}
-        with _interrupts_ignored():  # what is started here goes on ignoring them: we end it
+        with _interrupts_wait():
             for number, item in numbered.items():
                 try:
                     futures[pool.submit(_attempt, function, item)] = number
@@ -167,15 +167,16 @@ def _start_worker(lifeline: Connection) -> None:
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
+def _interrupts_wait() -> Iterator[None]:
+    """Put Ctrl-C off until the end of the block; what is started in it never gets any."""
+    if os.name != "posix":
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _died() -> RunError:
