@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from typer.core import TyperGroup
 
 from neuroslam.errors import NeuroslamError
 from neuroslam.experiments import EXPERIMENTS
@@ -23,7 +24,19 @@ if TYPE_CHECKING:
     from neuroslam.runs import RunSummary
     from neuroslam.types import StepResult
 
+
+class _Commands(TyperGroup):
+    """Commands whose interruption is told by :func:`main`; typer's own would say nothing."""
+
+    def invoke(self, ctx: typer.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Brain-inspired SLAM: from a video to a map.",
     no_args_is_help=True,
     add_completion=False,
@@ -179,6 +192,46 @@ def merge_command(
         return REFUSED
     _print_not_joined(summary)
     console.print(f"Written: {out}")
+    return 0
+
+
+@app.command("tune")
+def tune_command(
+    source: Source,
+    out: Out,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    stop: Stop = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier tuning in the folder.")
+    ] = False,
+) -> int:
+    """Find the parameters of a SOURCE's pictures, without truth; write a config for `run`."""
+    from neuroslam.runs import resolve_config
+    from neuroslam.tuning import tune
+
+    with _stages("tune") as on_stage:
+        tuning = tune(
+            source,
+            out,
+            resolve_config(preset, config, tuple(assignments or ())),
+            stop=stop,
+            overwrite=overwrite,
+            on_stage=on_stage,
+        )
+    table = Table("parameter", "before", "found", "because")
+    for key, (before, found, why) in tuning.changes.items():
+        table.add_row(key, *("none" if v is None else _shown(v) for v in (before, found)), why)
+    console.print(table)
+    for note in tuning.notes:
+        console.print(note)
+    for name, trial in (("before", tuning.before), ("found", tuning.after)):
+        console.print(
+            f"{name}: {trial.n_places} places, {trial.n_links} links, "
+            f"inconsistency {_shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
+        )
+    console.print(f"Written: {out}; now: neuroslam run {source} --config {out}/config.toml -o map")
     return 0
 
 
@@ -460,6 +513,17 @@ def _shown(value: object) -> str:
 
 
 @contextmanager
+def _stages(name: str) -> Iterator[Callable[[str], None]]:
+    """Show what is being done, and for how long already; yield what tells it."""
+    columns = (TextColumn("{task.description}", style="bold", markup=False), TimeElapsedColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda stage: bar.update(task, description=f"{name}: {stage}")
+
+
+@contextmanager
 def _counting(name: str) -> Iterator[Callable[[str, int, int], None]]:
     """Show how many of several runs are done; yield what tells it."""
     columns = (
@@ -592,7 +656,7 @@ def main(argv: list[str] | None = None) -> int:
     command = arguments[0] if arguments else ""
     try:
         return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
-    except (typer.Abort, KeyboardInterrupt):
+    except typer.Abort:
         _complain(command, "interrupted")
         return INTERRUPTED
     except typer.TyperException as error:

@@ -15,7 +15,7 @@ FLOW = [
     "semantic_drawing", "cell_panels", "semantic_panels",
     "merge_drawing", "comparison_drawing", "sweep_drawing", "recording", "run_files",
     "inspection", "export",
-    "review", "report", "runs", "merging", "sweeps", "fleets", "demo",
+    "review", "report", "runs", "tuning", "merging", "sweeps", "fleets", "demo",
     "experiments", "cli",
 ]  # fmt: skip
 SIDE_BY_SIDE = {("odometry", "view"), ("view", "odometry")}

@@ -57,7 +57,7 @@ def test_an_error_of_a_users_stops_only_its_item(jobs):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_bug_is_raised_as_it_is(jobs):
-    with pytest.raises(ValueError, match="math domain error|nonnegative"):
+    with pytest.raises(ValueError, match=r"math domain error|nonnegative"):
         parallel_map(math.sqrt, [4.0, -1.0], jobs)
 
 

@@ -1,0 +1,5 @@
+"""Finding the parameters of a video from the video itself, without truth."""
+
+from neuroslam.tuning.tune import Tuning, tune
+
+__all__ = ["Tuning", "tune"]

@@ -1,0 +1,107 @@
+"""The figure of a tuning: what was compared, what was chosen, and the map before and after."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, OTHER, STYLE, new_figure
+from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG
+
+if TYPE_CHECKING:
+    from neuroslam.tuning.search import Trial
+    from neuroslam.tuning.tune import Tuning
+
+
+def plot_tuning(tuning: "Tuning", name: str) -> Figure:
+    """Draw what tuning compared and chose, and the map before and after."""
+    n, found = len(tuning.keys), len(tuning.revisits.same)
+    title = f"{Path(name).name}: {100 * found / n:.0f} % of {n} key frames show a place seen twice"
+    with mpl.rc_context(STYLE):
+        figure = new_figure(13.0, 8.0, title.replace("$", r"\$"))
+        axes = figure.subplots(2, 3)
+        _draw_differences(axes[0, 0], tuning)
+        _draw_templates(axes[0, 1], tuning)
+        _draw_field_of_view(axes[0, 2], tuning)
+        _draw_maps(axes[1, 0], tuning)
+        _draw_track(axes[1, 1], tuning.before, "Before")
+        _draw_track(axes[1, 2], tuning.after, "Found")
+    return figure
+
+
+def _draw_differences(axes: Axes, tuning: "Tuning") -> None:
+    score, threshold = tuning.views[0], tuning.config.view.threshold
+    kinds = (("neighbours in time", score.neighbours, ODOMETRY), ("one place, two times",
+             score.revisits, MAP), ("two places", score.others, LOOP))  # fmt: skip
+    top = max(float(values.max()) for _, values, _ in kinds if len(values))
+    bins = np.linspace(0.0, top, 60)
+    for label, values, colour in kinds:
+        if len(values):
+            weights = np.full(len(values), 100.0 / len(values))
+            axes.hist(values, bins, weights=weights, histtype="step", lw=1.6, color=colour,
+                      label=label)  # fmt: skip
+    axes.axvline(threshold, color=INK, ls="--", lw=1.0, label=f"threshold {threshold:g}")
+    axes.set(title="How different two views are", xlabel="mean difference of grey (0 to 1)",
+             ylabel="pairs (%)", xlim=(0.0, top))  # fmt: skip
+    axes.legend()
+
+
+def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
+    seen: dict[str, float] = {}
+    for score in tuning.views:
+        config = score.config
+        rows = "all rows" if config.crop is None else f"rows {config.crop[2]} to {config.crop[3]}"
+        patch = f", patch {config.patch_radius}" if config.patch_radius else ""
+        label = f"{config.template_width} x {config.template_height}, {rows}{patch}"
+        seen.setdefault(label, score.average_precision)
+    chosen = next(iter(seen))
+    ordered = sorted(seen.items(), key=lambda item: item[1])
+    axes.barh([label for label, _ in ordered], [value for _, value in ordered], height=0.7,
+              color=[MAP if label == chosen else "#b9cfe0" for label, _ in ordered])  # fmt: skip
+    axes.set(title="Templates: telling places apart", xlabel="average precision", xlim=(0.0, 1.0))
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(axis="y", labelsize=7)
+
+
+def _draw_field_of_view(axes: Axes, tuning: "Tuning") -> None:
+    axes.set(title="Field of view: do loops close?", xlabel="horizontal field of view (°)",
+             ylabel="error of the turns of loops, 1 - cos")  # fmt: skip
+    motion = tuning.motion
+    if motion is None:
+        axes.text(0.5, 0.5, "not told by this drive", transform=axes.transAxes, ha="center")
+        return
+    axes.plot(FIELDS_OF_VIEW_DEG, motion.error, color=MAP)
+    axes.axvline(motion.fov_deg, color=INK, ls="--", lw=1.0, label=f"{motion.fov_deg:.0f}°")
+    axes.set_ylim(bottom=0.0)
+    axes.legend()
+
+
+def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
+    axes.set(title="Maps: inconsistency", xlabel="threshold of the views",
+             ylabel="distance of revisits / of other pairs")  # fmt: skip
+    if not tuning.trials:
+        axes.text(0.5, 0.5, "no place was seen twice", transform=axes.transAxes, ha="center")
+        return
+    energies = sorted({trial.config.pose_cells.inject_energy for trial in tuning.trials})
+    for energy, colour in zip(energies, (OTHER, MAP, LOOP, ODOMETRY), strict=False):
+        some = [t for t in tuning.trials if t.config.pose_cells.inject_energy == energy]
+        axes.plot([t.config.view.threshold for t in some], [t.inconsistency for t in some],
+                  ".-", color=colour, label=f"injection {energy:g}")  # fmt: skip
+    axes.axvline(tuning.config.view.threshold, color=INK, ls="--", lw=1.0, label="chosen")
+    axes.set_yscale("log")
+    axes.legend()
+
+
+def _draw_track(axes: Axes, trial: "Trial", title: str) -> None:
+    off = trial.inconsistency
+    told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
+    axes.plot(*trial.track_xy.T, color=MAP, lw=0.6)
+    axes.plot(*trial.track_xy[0], "o", color=OTHER, ms=5, label="start")
+    axes.plot(*trial.track_xy[-1], "s", color=INK, ms=4, label="end")
+    axes.set(title=f"{title}: {trial.n_places} places{told}", xlabel="x (m, not to scale)",
+             ylabel="y (m, not to scale)")  # fmt: skip
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend()
