@@ -7,6 +7,7 @@ from rich.table import Table
 
 from benchmarks import (
     bench_arena,
+    bench_batches,
     bench_end_to_end,
     bench_merge,
     bench_navigation,
@@ -29,6 +30,7 @@ def main() -> None:
         bench_arena,
         bench_navigation,
         bench_ssp,
+        bench_batches,
         bench_end_to_end,
     ):
         for row in module.rows():

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells import PoseCellNetwork, circular_convolve, gaussian_kernel
-from neuroslam.cells.attractor import decode, decode_batch, inject, path_integrate
+from neuroslam.cells.attractor import decode, inject, path_integrate
 from neuroslam.cells.convolve import Packet, to_dense, to_packet, trim, widen
+from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori
 from neuroslam.config import PoseCellConfig
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
@@ -236,15 +237,16 @@ def test_one_brain_and_a_batch_agree():
         torch.testing.assert_close(together, torch.tensor(alone, dtype=torch.float64))
     torch.testing.assert_close(batch.activity[2], singles[2].activity)
     torch.testing.assert_close(
-        decode_batch(batch.packet, 3)[1], torch.tensor(singles[1].estimate, dtype=torch.float64)
+        decode_all(batch.packet, 3)[1], torch.tensor(singles[1].estimate, dtype=torch.float64)
     )
 
 
 def test_gradients_reach_the_motion_through_a_step():
-    start = to_packet(PoseCellNetwork(PoseCellConfig(precision="float64")).activity[None])
+    start = to_packets(PoseCellNetwork(PoseCellConfig(precision="float64")).activity[None])
     distance = torch.tensor([0.4], dtype=torch.float64, requires_grad=True)
-    moved = path_integrate(start, distance, torch.tensor([0.2], dtype=torch.float64))
-    (moved.values * torch.arange(21, dtype=torch.float64)).sum().backward()
+    turn, aside = torch.tensor([0.2], dtype=torch.float64), torch.zeros(1, 2)
+    moved = to_tori(move_all(start, distance, turn, aside))
+    (moved * torch.arange(21, dtype=torch.float64)).sum().backward()
     assert distance.grad.item() == pytest.approx(-1.0, abs=0.02)  # the start heads along -x
 
 
@@ -382,3 +384,41 @@ def test_state_goes_through_a_state_dict_and_a_change_of_type(batch):
             Motion(torch.full((2,), 0.3) if batch else 0.3, torch.zeros(2) if batch else 0.1, 1.0)
         )
     assert torch.equal(copy.activity, cells.activity)
+
+
+@given(seed=st.integers(0, 1000), cells=st.integers(1, 5), brains=st.integers(1, 3))
+@settings(max_examples=60, deadline=None)
+def test_windows_of_a_batch_hold_all_activity_and_are_no_larger_than_alone(seed, cells, brains):
+    generator = torch.Generator().manual_seed(seed)
+    tori = torch.zeros(brains, 9, 7, 8)
+    for torus in tori:
+        where = torch.randint(torus.numel(), (cells,), generator=generator)
+        torus.view(-1)[where] = torch.rand(cells, generator=generator) + 0.1
+    packets = to_packets(tori)
+    assert torch.equal(to_tori(packets), tori)
+    alone = torch.tensor([to_packet(torus).values.shape for torus in tori])
+    assert (torch.tensor(packets.values.shape[1:]) <= alone.amax(0)).all()
+
+
+@given(seed=st.integers(0, 1000), speed=st.floats(-3.0, 3.0), turn=st.floats(-2.0, 2.0))
+@settings(max_examples=60, deadline=None)
+def test_each_brain_of_a_batch_moves_as_it_would_alone(seed, speed, turn):
+    generator = torch.Generator().manual_seed(seed)
+    shape, aside = (12, 9, 9), torch.rand(2, 2, generator=generator).double() - 0.5
+    at = [torch.rand(3, generator=generator).double() * 9 for _ in range(2)]
+    packets = [packet_at(shape, PoseEstimate(*where.tolist())) for where in at]
+    tori = torch.stack([to_dense(packet) for packet in packets])
+    distances, turns = torch.tensor([speed, -speed / 2]), torch.tensor([turn, turn / 3])
+    moved = move_all(to_packets(tori), distances.double(), turns.double(), aside)
+    for k, packet in enumerate(packets):
+        alone = path_integrate(
+            packet, distances[k].item(), turns[k].item(), tuple(aside[k].tolist())
+        )
+        torch.testing.assert_close(to_tori(moved)[k], to_dense(alone), rtol=0, atol=1e-6)
+
+
+def test_a_silent_brain_in_a_batch_is_refused():
+    tori = torch.zeros(2, 3, 3, 3)
+    tori[0, 1, 1, 1] = 1.0
+    with pytest.raises(MapError, match="no activity in a brain of the batch"):
+        to_packets(tori)

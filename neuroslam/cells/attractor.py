@@ -36,13 +36,13 @@ def couplings(
     """Prepare the products of :func:`settle` for a window of ``sizes`` on a torus of ``shape``."""
     pairs = []
     for up, down, size, n in zip(excite, inhibit, sizes, shape, strict=True):
-        reach = down.shape[0] // 2
-        alone = torch.nn.functional.pad(up, (reach, reach))
-        # E then I is one kernel, E * I: full convolution of the two.
+        # E then I is one kernel, E * I: full convolution of the two. Where E does not reach there
+        # is nothing but inhibition, and so no activity: those cells need no rows.
         both = torch.nn.functional.conv1d(
-            up[None, None], down.flip(0)[None, None], padding=2 * reach
+            up[None, None], down.flip(0)[None, None], padding=down.shape[0] - 1
         )[0, 0]
-        pairs.append(torch.stack([circulant(alone, size, n), circulant(both, size, n)]))
+        reach = up.shape[0] // 2
+        pairs.append(torch.stack([circulant(up, size, n, reach), circulant(both, size, n, reach)]))
     theta, y, x = pairs
     return Couplings(
         torch.cat([theta[0], -theta[1]], dim=1).contiguous(),
@@ -63,13 +63,13 @@ def settle(
     (multisession RatSLAM, Eqs. 1 and 3; :math:`*` is the circular convolution.)
 
     Args:
-        packet: :math:`P`, values ``(..., a, b, c)``.
+        packet: :math:`P`, values ``(a, b, c)``, or of a batch ``(brains, a, b, c)``.
         coupled: Kernels as matrices for windows of this size, from :func:`couplings`.
-        reach: Half width of both kernels together, for theta, y and x.
+        reach: Half width of the excitation kernel, for theta, y and x.
         global_inhibition: :math:`\varphi`, activity removed from every cell.
 
     Returns:
-        Non-negative activity of sum 1 (for each brain of a batch).
+        Non-negative activity of sum 1 (for each brain of a batch, whose windows are not trimmed).
 
     Raises:
         MapError: If inhibition silenced every cell.
@@ -90,9 +90,12 @@ def settle(
     field = (field / total).reshape(
         *batch, coupled.theta.shape[0], coupled.y.shape[-2], coupled.x.shape[-1]
     )
+    if batch:
+        n = torch.tensor(packet.shape, device=values.device)
+        origin = (packet.origin - torch.tensor(reach, device=values.device)) % n
+        return Packet(field, origin, packet.shape)
     origin = tuple((o - r) % n for o, r, n in zip(packet.origin, reach, packet.shape, strict=True))
-    settled = Packet(field, origin, packet.shape)
-    return settled if batch else trim(settled)
+    return trim(Packet(field, origin, packet.shape))
 
 
 def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Tensor:
@@ -141,9 +144,9 @@ def _headings(n_theta: int, dtype: torch.dtype, device: torch.device) -> tuple[T
 
 def path_integrate(
     packet: Packet,
-    distance_cells: float | Tensor,
-    turn_cells: float | Tensor,
-    aside_cells: Tensor | tuple[float, float] = (0.0, 0.0),
+    distance_cells: float,
+    turn_cells: float,
+    aside_cells: tuple[float, float] = (0.0, 0.0),
 ) -> Packet:
     r"""Move every layer along its heading, then turn all layers: activity follows odometry.
 
@@ -151,41 +154,31 @@ def path_integrate(
     activity moves along theta (linear). Any distance, backward too; a lap of the torus comes home.
 
     Args:
-        packet: Values ``(..., a, b, c)``.
-        distance_cells: :math:`d = v\,dt / \text{cell size}`; a number, or ``(...)`` in a batch.
-        turn_cells: :math:`\omega\,dt\,n_\theta / 2\pi`; likewise.
-        aside_cells: x and y by which all layers move besides; two numbers, or ``(..., 2)``.
+        packet: Activity of one brain, values ``(a, b, c)``.
+        distance_cells: :math:`d = v\,dt / \text{cell size}`.
+        turn_cells: :math:`\omega\,dt\,n_\theta / 2\pi`.
+        aside_cells: x and y by which all layers move besides.
 
     Returns:
         Activity of the same sum.
     """
     values = packet.values
-    batched = values.dim() > 3
-    sizes, (n_theta, n_y, n_x) = values.shape[-3:], packet.shape
+    sizes, (n_theta, n_y, n_x) = values.shape, packet.shape
     layers = slice(packet.origin[0], packet.origin[0] + sizes[0])
     table, numbers = _headings(n_theta, values.dtype, values.device)
-    directions = table[:, layers]
-    if batched:  # every brain keeps the whole torus
-        distance = torch.as_tensor(distance_cells, dtype=values.dtype, device=values.device)
-        shifts = distance[..., None, None] * directions
-        shifts = shifts + torch.as_tensor(aside_cells).to(values)[..., None]
-        windows = ((0, n_x), (0, n_y))
-        turn = torch.as_tensor(turn_cells, dtype=values.dtype, device=values.device)
-        first_theta, n_out_theta = 0, n_theta
-    else:
-        shifts = distance_cells * directions
-        if any(aside_cells):
-            shifts = shifts + values.new_tensor(aside_cells)[:, None]
-        windows = []
-        for axis, n, row, aside in zip((2, 1), (n_x, n_y), numbers, aside_cells, strict=True):
-            ends = [distance_cells * end + aside for end in (min(row[layers]), max(row[layers]))]
-            windows.append(_window(sizes[axis], n, min(ends), max(ends)))
-        turn = values.new_tensor(turn_cells)
-        first_theta, n_out_theta = _window(sizes[0], n_theta, turn_cells, turn_cells)
+    shifts = distance_cells * table[:, layers]
+    if any(aside_cells):
+        shifts = shifts + values.new_tensor(aside_cells)[:, None]
+    windows = []
+    for axis, n, row, aside in zip((2, 1), (n_x, n_y), numbers, aside_cells, strict=True):
+        ends = [distance_cells * end + aside for end in (min(row[layers]), max(row[layers]))]
+        windows.append(_window(sizes[axis], n, min(ends), max(ends)))
     (first_x, n_out_x), (first_y, n_out_y) = windows
-    along_x = shift_matrix(shifts[..., 0, :], first_x, n_out_x, sizes[2], n_x)
-    along_y = shift_matrix(shifts[..., 1, :], first_y, n_out_y, sizes[1], n_y)
+    first_theta, n_out_theta = _window(sizes[0], n_theta, turn_cells, turn_cells)
+    along_x = shift_matrix(shifts[0], first_x, n_out_x, sizes[2], n_x)
+    along_y = shift_matrix(shifts[1], first_y, n_out_y, sizes[1], n_y)
     moved = along_y @ values @ along_x.transpose(-1, -2)
+    turn = values.new_tensor(turn_cells)
     along_theta = shift_matrix(turn, first_theta, n_out_theta, sizes[0], n_theta)
     turned = (along_theta @ moved.flatten(-2, -1)).unflatten(-1, (n_out_y, n_out_x))
     o_theta, o_y, o_x = packet.origin
@@ -309,35 +302,3 @@ def decode(packet: Packet, radius: int) -> PoseEstimate:
         co = sum(w * math.cos(unit * (low + i - p)) for i, w in enumerate(weights))
         found.append((origin + p - roll + math.atan2(s, co) / unit) % n)
     return PoseEstimate(found[2], found[1], found[0])
-
-
-def decode_batch(packet: Packet, radius: int) -> Tensor:
-    """Find the dominant packet of every brain of a batch; :func:`decode` has the equation.
-
-    Args:
-        packet: Activity of the whole torus, values ``(batch, n_theta, n_y, n_x)``.
-        radius: Cells to each side of the peak.
-
-    Returns:
-        x, y, theta in cells, shape ``(batch, 3)``.
-    """
-    activity = packet.values
-    batch, *shape = activity.shape
-    peak = activity.flatten(1).argmax(1)
-    _, n_y, n_x = shape
-    peaks = torch.stack([peak // (n_y * n_x), peak // n_x % n_y, peak % n_x], dim=1)
-    offsets = torch.arange(-radius, radius + 1, device=activity.device)
-    index = peaks[:, :, None] + offsets  # (batch, 3, 2 radius + 1)
-    sizes = torch.tensor(shape, device=activity.device)
-    index = index % sizes[:, None]
-    brains = torch.arange(batch, device=activity.device)[:, None, None, None]
-    near = activity[
-        brains, index[:, 0, :, None, None], index[:, 1, None, :, None], index[:, 2, None, None, :]
-    ]
-    marginals = torch.stack([near.sum((2, 3)), near.sum((1, 3)), near.sum((1, 2))], dim=1)
-    unit = TWO_PI / sizes.to(activity.dtype)
-    angles = offsets.to(activity.dtype) * unit[:, None]
-    turn = torch.atan2((marginals * angles.sin()).sum(-1), (marginals * angles.cos()).sum(-1))
-    origin = torch.tensor(packet.origin, device=activity.device)
-    found = (peaks + origin + turn / unit) % sizes
-    return found.flip(-1)

@@ -22,12 +22,13 @@ class Packet(NamedTuple):
 
     Attributes:
         values: Shape ``(..., a, b, c)``, a window in theta, y, x; it may have batch dimensions.
-        origin: Torus coordinates of the window's first cell, in ``[0, n)`` on each axis.
+        origin: Torus coordinates of the window's first cell, in ``[0, n)`` on each axis; in a
+            batch those of each brain's window, ``(brains, 3)``.
         shape: Size of the torus ``(n_theta, n_y, n_x)``.
     """
 
     values: Tensor
-    origin: tuple[int, int, int]
+    origin: tuple[int, int, int] | Tensor
     shape: tuple[int, int, int]
 
 
@@ -47,16 +48,18 @@ def gaussian_kernel(size: int, std_cells: float, dtype: torch.dtype = torch.floa
     return (weights / weights.sum()).to(dtype)
 
 
-def circulant(kernel: Tensor, n_in: int, n: int) -> Tensor:
+def circulant(kernel: Tensor, n_in: int, n: int, reach: int | None = None) -> Tensor:
     r"""Return the matrix that convolves ``n_in`` neighbouring cells of a ring of ``n``.
 
-    Row :math:`i` is the cell :math:`i - r` places after the window's first, :math:`r` being half
-    the kernel's width. Rows that would pass once round the ring fall onto their cell.
+    Row :math:`i` is the cell :math:`i - r` places after the window's first. Rows that would pass
+    once round the ring fall onto their cell.
 
     Args:
         kernel: Odd number of weights, at most ``n``.
         n_in: Cells in the window.
         n: Cells in the ring.
+        reach: :math:`r`, how far beyond the window cells are looked at; half the kernel's width,
+            which is all that the window reaches, if not given.
 
     Returns:
         Shape ``(min(n_in + 2 r, n), n_in)``.
@@ -66,11 +69,14 @@ def circulant(kernel: Tensor, n_in: int, n: int) -> Tensor:
         [1.0, 2.0, 3.0]
     """
     size = kernel.shape[0]
-    n_out = min(n_in + size - 1, n)
+    reach = size // 2 if reach is None else reach
+    n_out = min(n_in + 2 * reach, n)
     columns = torch.arange(n_in, device=kernel.device).repeat_interleave(size)
-    rows = (columns + torch.arange(size, device=kernel.device).repeat(n_in)) % n
+    taps = torch.arange(size, device=kernel.device) - size // 2 + reach
+    rows = (columns + taps.repeat(n_in)) % n
+    held = rows < n_out
     empty = kernel.new_zeros(n_out, n_in)
-    return empty.index_put((rows, columns), kernel.repeat(n_in), accumulate=True)
+    return empty.index_put((rows[held], columns[held]), kernel.repeat(n_in)[held], accumulate=True)
 
 
 def multiply_axes(values: Tensor, along: tuple[Tensor, Tensor, Tensor]) -> Tensor:

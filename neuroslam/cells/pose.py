@@ -10,12 +10,12 @@ from neuroslam.cells.attractor import (
     Couplings,
     couplings,
     decode,
-    decode_batch,
     inject,
     path_integrate,
     settle,
 )
 from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense, to_packet
+from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all
 from neuroslam.config import PoseCellConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
@@ -73,9 +73,10 @@ class PoseCellNetwork(Population):
             {name: ((), torch.float64) for name in ("x", "y", "theta")} | {"decay": ((), dtype)}
         )
         self.register_buffer("window", torch.ones(1, 1, 1, dtype=dtype))
-        self.register_buffer("origin", torch.zeros(3, dtype=torch.int64))
+        brains = () if batch is None else (batch,)
+        self.register_buffer("origin", torch.zeros(*brains, 3, dtype=torch.int64))
         self.last = Scalars(view=NO_TEMPLATE)
-        slip = torch.zeros(3 if batch is None else (batch, 3), dtype=torch.float64)
+        slip = torch.zeros(*brains, 3, dtype=torch.float64)
         self.register_buffer("slip", slip)
         self._couplings: dict[tuple[int, int, int], Couplings] = {}
         # In use the state is here, not in the buffers: those would cost more than the cells do.
@@ -114,7 +115,7 @@ class PoseCellNetwork(Population):
     @property
     def activity(self) -> Tensor:
         """The belief: shape ``([batch,] n_theta, n_y, n_x)``, non-negative, sum 1."""
-        return to_dense(self.packet)
+        return (to_dense if self.batch is None else to_tori)(self.packet)
 
     @activity.setter
     def activity(self, activity: Tensor) -> None:
@@ -123,14 +124,15 @@ class PoseCellNetwork(Population):
             raise MapError(
                 f"PoseCellNetwork: activity has shape {tuple(activity.shape)}, expected {expected}"
             )
-        self.packet = to_packet(activity.to(self.window))
+        take = to_packet if self.batch is None else to_packets
+        self.packet = take(activity.to(self.window))
         self._now.slip = _no_slip(self.slip)
 
     @property
     def estimate(self) -> PoseEstimate | Tensor:
         """Centre of the dominant packet in cells; in a batch x, y, theta, shape ``(batch, 3)``."""
         if self._now.estimate is None:
-            find = decode if self.batch is None else decode_batch
+            find = decode if self.batch is None else decode_all
             self._now.estimate = find(self._now.packet, self.config.decode_radius)
         return self._now.estimate
 
@@ -158,7 +160,7 @@ class PoseCellNetwork(Population):
                     *(m.to(device=self.window.device, dtype=self.window.dtype) for m in made)
                 )
             self._couplings[sizes] = coupled
-        reach = (c.excite_size // 2 + c.inhibit_size // 2,) * 3
+        reach = (c.excite_size // 2,) * 3
         distance = motion.v_m_s * motion.dt_s / c.cell_size_m
         turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
         follows = c.exact_gain and not now.injected
@@ -171,7 +173,8 @@ class PoseCellNetwork(Population):
             x, y, theta = now.slip
             self.packet = path_integrate(settled, distance, turn + theta, (x, y))
         else:
-            self.packet = path_integrate(settled, distance, turn + now.slip[:, 2], now.slip[:, :2])
+            settled = trim_all(settled)
+            self.packet = move_all(settled, distance, turn + now.slip[:, 2], now.slip[:, :2])
         if follows:
             self._measure_slip(before, distance, turn)
         return self.estimate
@@ -302,12 +305,17 @@ class PoseCellNetwork(Population):
 
     def _write_buffers(self) -> None:
         packet, slip = self._now.packet, self._now.slip
-        self.window, self.origin = packet.values, torch.tensor(packet.origin)
-        self.slip = slip if self.batch is not None else torch.tensor(slip, dtype=torch.float64)
+        if self.batch is None:
+            self.window, self.origin = packet.values, torch.tensor(packet.origin)
+            self.slip = torch.tensor(slip, dtype=torch.float64)
+        else:
+            (self.window, self.origin), self.slip = packet[:2], slip
 
     def _read_buffers(self) -> None:
-        packet = Packet(self.window, tuple(self.origin.tolist()), self.shape)
-        self._now = _Now(packet, self.slip if self.batch is not None else self.slip.tolist())
+        one = self.batch is None
+        origin = tuple(self.origin.tolist()) if one else self.origin
+        slip = self.slip.tolist() if one else self.slip
+        self._now = _Now(Packet(self.window, origin, self.shape), slip)
 
     def _apply(self, fn: object, recurse: bool = True) -> "PoseCellNetwork":
         self._couplings.clear()
