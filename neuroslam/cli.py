@@ -77,7 +77,8 @@ Source = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-        "VIDEO+MOTION.csv, arena:NAME or world:NAME.",
+        "TUM, KITTI or EuRoC folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
+        "world:NAME.",
     ),
 ]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]

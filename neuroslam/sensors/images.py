@@ -25,7 +25,7 @@ import numpy as np
 from neuroslam.errors import BadFrame, SourceError
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.tracks import Clock, Track, parse_motion
-from neuroslam.types import Frame
+from neuroslam.types import Frame, Pose
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
@@ -58,6 +58,7 @@ class ImageSource(IndexedSource):
         times_s: Their times, or ``None``: those of the motion, or else ``index / frame_rate_hz``.
         frame_rate_hz: Frames per second where there are no times.
         motion: Measured motion, a row a picture.
+        truth: True poses, ``(n, 3)``, NaN where unknown; ``None``: those of the motion, if any.
 
     Raises:
         SourceError: If no picture can be decoded, or the times or the motion are not as many.
@@ -70,8 +71,10 @@ class ImageSource(IndexedSource):
         times_s: np.ndarray | None,
         frame_rate_hz: float,
         motion: Track | None = None,
+        truth: np.ndarray | None = None,
     ) -> None:
         self.name = name
+        self.truth = truth if truth is not None or motion is None else motion.truth
         self.pictures = pictures
         self.n_frames = len(pictures)
         self.motion = motion
@@ -88,7 +91,8 @@ class ImageSource(IndexedSource):
         """Make the frame of that number, see :meth:`IndexedSource.frame`."""
         time_s = self.clock.at(index)
         velocity = None if self.motion is None else self.motion.velocity(index)
-        truth = None if self.motion is None else self.motion.pose(index)
+        truth = None if self.truth is None else self.truth[index]
+        truth = None if truth is None or not np.isfinite(truth).all() else Pose(*truth.tolist())
         image = self._decoded(index)
         require_shape(image, self.image_shape, self.name, index, self.pictures[index].name)
         return Frame(index, time_s, image=image, velocity=velocity, truth=truth)

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from neuroslam.errors import SourceError
+from neuroslam.sensors.camera import CameraSource
+from neuroslam.sensors.datasets import open_dataset
 from neuroslam.sensors.images import (
     is_picture,
     open_folder,
@@ -14,6 +16,7 @@ from neuroslam.sensors.images import (
     read_text,
 )
 from neuroslam.sensors.rodent import ARENA_KEYS, read_walk
+from neuroslam.sensors.rosbag import is_bag, open_bag
 from neuroslam.sensors.senses import ArenaSource, open_arena
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
@@ -25,9 +28,10 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of pictures, an image list or motion CSV, an .npz or .npy track, "
-    "world:NAME, arena:NAME, or a camera and motion as drive.avi+motion.csv"
+    "a TUM, KITTI or EuRoC folder, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
+    "motion as drive.avi+motion.csv"
 )
-_MADE = ("world:", "arena:")
+_MADE = ("world:", "arena:", "camera:")
 
 
 def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
@@ -41,6 +45,9 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
     ``rat.npz`` with an arena in it     the same, and its walls (:mod:`neuroslam.sensors.rodent`)
+    TUM, KITTI or EuRoC folder          pictures and truth (:mod:`neuroslam.sensors.datasets`)
+    ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
+    ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
     ``world:NAME``                      a world rendered on the fly
     ``arena:NAME``, ``arena:rat.npz``   a walk sensed with noise (:mod:`neuroslam.sensors.senses`)
     ``drive.avi+motion.csv``            two of these merged by time: a camera, and motion
@@ -73,12 +80,26 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
             return open_world(spec)
         if isinstance(spec, str) and spec.startswith("arena:"):
             return open_arena(spec)
+        if isinstance(spec, str) and spec.startswith("camera:"):
+            return CameraSource(spec.removeprefix("camera:"))
+        path, topics = _bag_topics(str(spec))
+        if is_bag(path) and path.exists():
+            return open_bag(path, topics)
         path = Path(spec)
         if not path.exists():
             raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
         return _opener(path)(path, rate)
     except OSError as error:
         raise SourceError(f"{spec}: cannot be read ({error.strerror or error})") from None
+
+
+def _bag_topics(spec: str) -> tuple[Path, dict[str, str]]:
+    """Split ``drive.bag?image=/front`` into the path and the topics."""
+    name, mark, query = spec.partition("?")
+    if not mark or Path(spec).exists():
+        return Path(spec), {}
+    pairs = [part.partition("=") for part in query.split("&")]
+    return Path(name), {key: topic for key, _, topic in pairs}
 
 
 def absolute_spec(spec: str) -> str:
@@ -94,7 +115,12 @@ def absolute_spec(spec: str) -> str:
         name, mark, query = spec.removeprefix("arena:").partition("?")
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
         return f"arena:{name}{mark}{query}"
-    return spec if spec.startswith(_MADE) else str(Path(spec).resolve())
+    if spec.startswith(_MADE):
+        return spec
+    path, topics = _bag_topics(spec)
+    if topics and is_bag(path):
+        return str(path.resolve()) + spec.removeprefix(str(path))
+    return str(Path(spec).resolve())
 
 
 def seeded_spec(spec: str, seed: int) -> str:
@@ -140,7 +166,7 @@ def _exists(part: str) -> bool:
 def _opener(path: Path) -> Callable[[Path, float], Source]:
     name = path.name.lower()
     if path.is_dir():
-        return open_folder
+        return _open_folder
     if name.endswith(VIDEO_SUFFIXES):
         return VideoSource
     if name.endswith(_TAR_SUFFIXES):
@@ -151,6 +177,11 @@ def _opener(path: Path) -> Callable[[Path, float], Source]:
         return _open_positions
     what = "is a single picture" if is_picture(name) else "is of no known kind"
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
+
+
+def _open_folder(path: Path, frame_rate_hz: float) -> Source:
+    """Open a dataset if it is laid out like one, else the pictures in it."""
+    return open_dataset(path, frame_rate_hz) or open_folder(path, frame_rate_hz)
 
 
 def _open_table(path: Path, frame_rate_hz: float) -> Source:

@@ -1,0 +1,88 @@
+"""A live camera: ``camera:0``, or the address of a stream, ``camera:rtsp://...``."""
+
+import time
+from collections.abc import Iterator
+
+import cv2
+
+from neuroslam.errors import BadFrame, SourceError
+from neuroslam.sensors.images import quiet_opencv, require_shape
+from neuroslam.sensors.source import OnBadFrame, Source
+from neuroslam.types import Frame
+
+_PATIENCE = 10
+"""Pictures in a row that may fail before a camera counts as gone."""
+
+
+class CameraSource(Source):
+    """Pictures of a camera, in grey, as they come; it has no end, so stop it with Ctrl-C.
+
+    Times are those of the clock, in seconds since 1970, so that a run that is resumed goes on
+    later. A frame that the brain is too slow for is lost: the camera does not wait.
+
+    Args:
+        device: Number of a camera of this machine, or address of a stream.
+
+    Raises:
+        SourceError: If there is no such camera.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.name = f"camera:{device}"
+        self.device: int | str = int(device) if device.isdecimal() else device
+        self.n_frames = None
+        if device == "":
+            raise SourceError("camera: has no number; expected camera:0, or an address")
+        capture = self._capture()
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        self.frame_rate_hz = rate if 0.0 < rate < 1e4 else None
+        capture.release()
+
+    def frames(
+        self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
+    ) -> Iterator[Frame]:
+        """Yield pictures from now on; ``start`` is the number that the first one gets.
+
+        Raises:
+            SourceError: If the camera gives no pictures any more.
+        """
+        capture = self._capture()
+        epoch_s, began_s = time.time(), time.monotonic()
+        index, missed, shape = start, 0, None
+        try:
+            while stop is None or index < stop:
+                with quiet_opencv():
+                    there_is_one, image = capture.read()
+                if not there_is_one:
+                    missed += 1
+                    if missed >= _PATIENCE:
+                        raise SourceError(
+                            f"{self.name}: gives no pictures any more, after {index - start}; "
+                            "is it unplugged?"
+                        )
+                    continue
+                missed = 0
+                time_s = epoch_s + time.monotonic() - began_s
+                grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+                shape = shape or grey.shape
+                try:
+                    require_shape(grey, shape, self.name, index)
+                except BadFrame as fault:
+                    if on_bad_frame is None:
+                        raise
+                    on_bad_frame(fault)
+                else:
+                    yield Frame(index, time_s, image=grey)
+                index += 1
+        finally:
+            capture.release()
+
+    def _capture(self) -> cv2.VideoCapture:
+        with quiet_opencv():
+            capture = cv2.VideoCapture(self.device)
+        if not capture.isOpened():
+            capture.release()
+            raise SourceError(
+                f"{self.name}: cannot be opened; is it plugged in, and not used by another program?"
+            )
+        return capture

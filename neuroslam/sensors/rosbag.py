@@ -1,0 +1,273 @@
+"""Bags of ROS 1 and ROS 2: a camera, wheel odometry, a laser scanner; needs the extra ``rosbag``.
+
+``drive.bag``, a ``.db3`` or ``.mcap`` file, or a folder with ``metadata.yaml``. The first topic of
+each kind is taken, or the one named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuroslam.errors import BadFrame, SourceError
+from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.sensors.images import decode_grey, require_shape
+from neuroslam.sensors.source import OnBadFrame, Source
+from neuroslam.sensors.streams import Streams
+from neuroslam.types import Frame, Velocity
+
+BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+KINDS = {
+    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    "odometry": ("nav_msgs/msg/Odometry",),
+    "scan": ("sensor_msgs/msg/LaserScan",),
+}
+N_RANGES = 360
+"""Bearings that a scan is brought to, evenly over the full turn."""
+
+_GREY = {
+    "mono8": (np.uint8, 1, None),
+    "8UC1": (np.uint8, 1, None),
+    "mono16": (np.uint16, 1, None),
+    "16UC1": (np.uint16, 1, None),
+    "bgr8": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
+    "rgb8": (np.uint8, 3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2GRAY),
+    "yuv422": (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2),
+    "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
+}
+"""Encoding -> type and number of channels of a pixel, and how it becomes grey."""
+
+
+def is_bag(path: Path) -> bool:
+    """Tell a bag by its name, or a folder by its ``metadata.yaml``."""
+    return path.name.lower().endswith(BAG_SUFFIXES) or (path / "metadata.yaml").is_file()
+
+
+def open_bag(path: Path, topics: dict[str, str] | None = None) -> Source:
+    """Open a bag: its camera, its odometry, or both merged by time.
+
+    Args:
+        path: File or folder.
+        topics: Topic of each of ``KINDS`` that is not the first of its kind.
+
+    Raises:
+        SourceError: If ``rosbags`` is not installed, the bag is damaged, or has no such topic.
+    """
+    topics = topics or {}
+    if unknown := set(topics) - set(KINDS):
+        raise SourceError(f"{path}: unknown option {min(unknown)!r}; there are {', '.join(KINDS)}")
+    with _opened(path) as reader:
+        there = {c.topic: c.msgtype for c in reader.connections}
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+    chosen = {kind: _choose(path, kind, topics.get(kind), there) for kind in KINDS}
+    if chosen["image"] is None and chosen["odometry"] is None:
+        raise SourceError(
+            f"{path}: holds neither pictures nor odometry; its topics are {_listed(there)}"
+        )
+    motion = camera = None
+    if (topic := chosen["odometry"]) is not None:
+        motion = BagMotion(path, topic, chosen["scan"], counts[topic])
+    if (topic := chosen["image"]) is not None:
+        camera = BagCamera(path, topic, counts[topic])
+    return Streams(camera, motion) if camera and motion else camera or motion
+
+
+def _choose(path: Path, kind: str, wanted: str | None, there: dict[str, str]) -> str | None:
+    fitting = sorted(topic for topic, msgtype in there.items() if msgtype in KINDS[kind])
+    if wanted is None:
+        return fitting[0] if fitting else None
+    if wanted not in fitting:
+        what = "is not in it" if wanted not in there else f"has {there[wanted]}"
+        raise SourceError(
+            f"{path}: topic {wanted!r} {what}; for {kind} there are {', '.join(fitting) or 'none'}"
+        )
+    return wanted
+
+
+def _listed(there: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({msgtype})" for topic, msgtype in sorted(there.items())) or "none"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise SourceError(
+            f'{path}: is a ROS bag; to read it: pip install "neuroslam[rosbag]"'
+        ) from None
+    try:
+        kinds = get_typestore(Stores.ROS2_HUMBLE if path.suffix != ".bag" else Stores.ROS1_NOETIC)
+        with AnyReader([path], default_typestore=kinds) as reader:
+            yield reader
+    except (AnyReaderError, OSError, KeyError, ValueError, AssertionError) as error:
+        said = (str(error) or type(error).__name__).splitlines()[0]
+        raise SourceError(f"{path}: is not a whole ROS bag ({said})") from None
+
+
+class _BagTopic(Source):
+    """Messages of some topics, in order of time, as frames; what cannot be used is left out."""
+
+    def __init__(self, path: Path, topics: tuple[str, ...], n_messages: int) -> None:
+        self.path, self.topics = path, topics
+        self.name = f"{path}: {topics[0]}"
+        self.n_frames = n_messages
+        self.frame_rate_hz = None
+
+    def frames(
+        self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
+    ) -> Iterator[Frame]:
+        """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`."""
+        self._begin()
+        index, last_s = 0, -np.inf
+        with _opened(self.path) as reader:
+            wanted = [c for c in reader.connections if c.topic in self.topics]
+            for connection, received_ns, data in reader.messages(connections=wanted):
+                if stop is not None and index >= stop:
+                    return
+                message = reader.deserialize(data, connection.msgtype)
+                time_s = _time_s(message, received_ns)
+                if connection.topic != self.topics[0]:
+                    self._also(message)
+                    continue
+                try:
+                    frame = self._frame(index, time_s, message)
+                    if not time_s > last_s:
+                        raise BadFrame(
+                            f"{self.name}: frame {index}: its time {time_s:.6f} s is not after "
+                            f"{last_s:.6f} s; times must rise"
+                        )
+                    last_s = time_s
+                except BadFrame as fault:
+                    if index >= start:
+                        if on_bad_frame is None:
+                            raise
+                        on_bad_frame(fault)
+                else:
+                    if index >= start:
+                        yield frame
+                index += 1
+
+    def _begin(self) -> None:
+        """Forget what an earlier reading has left."""
+
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
+        raise NotImplementedError
+
+    def _also(self, message: Any) -> None:  # noqa: ANN401
+        """Take in a message of another topic than the first."""
+
+
+class BagCamera(_BagTopic):
+    """The pictures of a topic, in grey."""
+
+    def __init__(self, path: Path, topic: str, n_messages: int) -> None:
+        super().__init__(path, (topic,), n_messages)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.shape: tuple[int, ...] | None = None
+
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
+        image = _grey(message, self.name, index)
+        self.shape = self.shape or image.shape
+        require_shape(image, self.shape, self.name, index)
+        return Frame(index, time_s, image=image)
+
+
+class BagMotion(_BagTopic):
+    """The measured motion of a topic, and the ranges of another that were last scanned."""
+
+    def __init__(self, path: Path, topic: str, scan: str | None, n_messages: int) -> None:
+        super().__init__(path, (topic,) if scan is None else (topic, scan), n_messages)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.ranges: np.ndarray | None = None
+
+    def _also(self, message: Any) -> None:  # noqa: ANN401
+        self.ranges = full_turn(message.ranges, message.angle_min, message.angle_increment,
+                                message.range_min, message.range_max)  # fmt: skip
+
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
+        twist = message.twist.twist
+        v, w = float(twist.linear.x), float(twist.angular.z)
+        if not (np.isfinite(v) and np.isfinite(w)):
+            raise BadFrame(f"{self.name}: frame {index}: v = {v}, w = {w}; expected finite numbers")
+        return Frame(index, time_s, velocity=Velocity(v, w), ranges=self.ranges)
+
+
+def full_turn(
+    ranges: np.ndarray, first_rad: float, step_rad: float, least_m: float, most_m: float
+) -> np.ndarray:
+    """Bring the rays of a scanner to bearings evenly over the full turn.
+
+    Args:
+        ranges: Distances in metres, ``(n,)``.
+        first_rad: Bearing of the first, to the left positive.
+        step_rad: From one to the next.
+        least_m: Nearer is nothing.
+        most_m: Farther is nothing.
+
+    Returns:
+        Distances at ``N_RANGES`` bearings, counter-clockwise from straight ahead: that of the ray
+        nearest in bearing, ``inf`` where there is none within a step, or it met nothing.
+
+    Example:
+        >>> turn = full_turn(np.array([1.0, 2.0, 3.0]), -np.pi / 2, np.pi / 2, 0.1, 10.0)
+        >>> turn[[270, 0, 90, 180]].tolist()
+        [1.0, 2.0, 3.0, inf]
+    """
+    distances = np.asarray(ranges, np.float64)
+    distances = np.where((distances >= least_m) & (distances <= most_m), distances, np.inf)
+    bearings = np.arange(N_RANGES) * (TWO_PI / N_RANGES)
+    middle = first_rad + 0.5 * step_rad * (len(distances) - 1)
+    apart = wrap_angles(bearings - middle) + (middle - first_rad)
+    ray = np.rint(apart / step_rad).astype(np.int64)
+    held = (ray >= 0) & (ray < len(distances))
+    return np.where(held, distances[ray.clip(0, len(distances) - 1)], np.inf)
+
+
+def _time_s(message: Any, received_ns: int) -> float:  # noqa: ANN401
+    stamp = message.header.stamp
+    stamped = stamp.sec + stamp.nanosec * 1e-9
+    return stamped if stamped > 0.0 else received_ns * 1e-9
+
+
+def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
+    if hasattr(message, "format"):
+        image = decode_grey(bytes(message.data))
+        if image is None:
+            raise BadFrame(f"{name}: frame {index}: its picture is corrupt ({message.format})")
+        return image
+    if message.encoding not in _GREY:
+        raise BadFrame(
+            f"{name}: frame {index}: encoding {message.encoding!r}; expected one of "
+            f"{', '.join(_GREY)}"
+        )
+    kind, channels, conversion = _GREY[message.encoding]
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    h, w, used = message.height, message.width, message.width * channels * dtype.itemsize
+    data = np.asarray(message.data, np.uint8)
+    if message.step < used or len(data) < h * message.step:
+        raise BadFrame(
+            f"{name}: frame {index}: {len(data)} bytes in rows of {message.step} for {w} x {h} px "
+            f"{message.encoding}; it is damaged"
+        )
+    rows = np.ascontiguousarray(data[: h * message.step].reshape(h, message.step)[:, :used])
+    pixels = rows.view(dtype).reshape((h, w) if channels == 1 else (h, w, channels))
+    if dtype.itemsize == 2:
+        return (pixels >> 8).astype(np.uint8)
+    return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
