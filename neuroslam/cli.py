@@ -371,10 +371,10 @@ def export_command(
     path: MapFile,
     to: Annotated[Path, typer.Argument(metavar="TO", help="File to write.")],
     kind: Annotated[
-        str | None, typer.Option(help="tum, g2o or graphml; as TO ends if not given.")
+        str | None, typer.Option(help="tum, g2o, graphml or nir; as TO ends if not given.")
     ] = None,
 ) -> int:
-    """Write a map for other programs: TUM, g2o, GraphML."""
+    """Write a map for other programs: TUM, g2o, GraphML, NIR."""
     from neuroslam.export import export
 
     console.print(f"Written: {export(path, to, kind)}")

@@ -1,4 +1,4 @@
-"""A map for other programs: TUM for tracks, g2o for pose-graph solvers, GraphML for graph tools."""
+"""A map for other programs: tracks, pose-graph solvers, graph tools, neuromorphic simulators."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -9,9 +9,10 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.brain.sessions import session_name
-from neuroslam.errors import RunError
+from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.run_files import brain_file
+from neuroslam.spiking.export import export_nir
 from neuroslam.storage import write_atomically
 
 
@@ -28,11 +29,13 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
       of the config; vertex 0 is fixed.
     - ``graphml``: a node for each experience with its pose, its view and its origin, a directed
       edge for each link with all that it measured.
+    - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
+      (:func:`neuroslam.spiking.export.export_nir`, extra ``spiking-export``).
 
     Args:
         path: Brain file, or folder of a run.
         to: File to write, whole or not at all; it is replaced if it is there.
-        kind: ``tum``, ``g2o`` or ``graphml``; the suffix of ``to`` if not given.
+        kind: ``tum``, ``g2o``, ``graphml`` or ``nir``; the suffix of ``to`` if not given.
 
     Returns:
         ``to``.
@@ -41,11 +44,14 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
         CheckpointError: If the brain cannot be read.
         SourceError: If a run's trajectory cannot be read.
         RunError: If the kind is unknown, the map is empty or ``to`` cannot be written.
+        ConfigError: If ``nir`` is asked for and not installed, or the brain has no such neurons.
     """
     path, to = Path(path), Path(to)
     asked = kind or to.suffix.removeprefix(".").lower()
     if asked not in _WRITERS:
-        raise RunError(f"{to}: no such kind of export, {asked!r}; expected tum, g2o or graphml")
+        raise RunError(
+            f"{to}: no such kind of export, {asked!r}; expected tum, g2o, graphml or nir"
+        )
     source = brain_file(path)
     if to.resolve() == source.resolve():
         raise RunError(f"{to}: is the brain itself; take another file")
@@ -58,7 +64,7 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
             write_atomically(to, lambda file: file.write_bytes(text))
     else:
         brain = load_brain(source)
-        if not brain.map.n:
+        if not brain.map.n and asked != "nir":
             raise RunError(f"{path}: its map is empty, there is nothing to export")
         write = partial(_WRITERS[asked], brain, to)
     try:
@@ -127,6 +133,15 @@ def _write_graphml(brain: NavigationBrain, to: Path) -> None:
     write_atomically(to, lambda file: tree.write(file, encoding="utf-8", xml_declaration=True))
 
 
+def _write_nir(brain: NavigationBrain, to: Path) -> None:
+    if not brain.config.has("semantic") or brain.config.semantic.tier != "spiking":
+        raise ConfigError(
+            f"{to}: the brain has no spiking neurons; run it with semantic cells and "
+            "--set semantic.tier=spiking"
+        )
+    export_nir(brain.semantic.slam.integrator, to)
+
+
 def _add_data(element: ElementTree.Element, columns: dict[str, list], row: int) -> None:
     for name, values in columns.items():
         ElementTree.SubElement(element, "data", key=name).text = str(values[row])
@@ -136,4 +151,5 @@ _WRITERS: dict[str, Callable[[NavigationBrain, Path], None]] = {
     "tum": _write_tum,
     "g2o": _write_g2o,
     "graphml": _write_graphml,
+    "nir": _write_nir,
 }

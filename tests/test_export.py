@@ -9,7 +9,7 @@ import pytest
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
 from neuroslam.brain.sessions import session_name
 from neuroslam.config import BrainConfig
-from neuroslam.errors import CheckpointError, RunError, SourceError
+from neuroslam.errors import CheckpointError, ConfigError, RunError, SourceError
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.export import export
 from neuroslam.geometry import compose, wrap_angles
@@ -189,9 +189,13 @@ def test_a_map_of_one_place_has_no_edges(tmp_path):
 @pytest.mark.parametrize(
     ("to", "kind", "says"),
     [
-        ("map.svg", None, "map.svg: no such kind of export, 'svg'; expected tum, g2o or graphml"),
-        ("map", None, "map: no such kind of export, ''; expected tum, g2o or graphml"),
-        ("map.g2o", "dot", "no such kind of export, 'dot'; expected tum, g2o or graphml"),
+        (
+            "map.svg",
+            None,
+            "map.svg: no such kind of export, 'svg'; expected tum, g2o, graphml or nir",
+        ),
+        ("map", None, "map: no such kind of export, ''; expected tum, g2o, graphml or nir"),
+        ("map.g2o", "dot", "no such kind of export, 'dot'; expected tum, g2o, graphml or nir"),
         ("brain.safetensors", "g2o", "brain.safetensors: is the brain itself; take another file"),
         ("", "g2o", "cannot be written (Is a directory)"),
     ],
@@ -216,3 +220,14 @@ def test_nothing_is_exported_of_nothing(folder, tmp_path):
     with pytest.raises(SourceError, match="line 1: got 3 numbers"):
         export(out, tmp_path / "track.tum")
     assert not (tmp_path / "track.tum").exists()
+
+
+def test_the_spiking_neurons_of_a_brain_are_exported_and_others_told_so(chain, tmp_path):
+    nir = pytest.importorskip("nir", reason="NIR is an extra")
+    spiking = {"tier": "spiking", "time_step_s": 0.001, "space": {"n_rotations": 1, "n_scales": 1}}
+    brain = NavigationBrain(BrainConfig(cells="pose+semantic", semantic=spiking))
+    save_brain(brain, tmp_path / "spiking.safetensors")
+    graph = nir.read(export(tmp_path / "spiking.safetensors", tmp_path / "walk.nir"))
+    assert len(graph.nodes) == 8 * brain.semantic.slam.space.n_frequencies
+    with pytest.raises(ConfigError, match="has no spiking neurons; run it with semantic cells"):
+        export(chain, tmp_path / "none.nir")
