@@ -87,7 +87,7 @@ def test_a_closed_map_is_consistent_and_a_heap_or_an_open_one_is_not():
     none, n = np.empty((0, 0)), 200
     same = np.stack([np.arange(100), np.arange(100, 200)], axis=1)
     other = np.stack([np.arange(100), (np.arange(100) + 150) % 200], axis=1)
-    pairs = Revisits(none, none, 0.0, 0.0, 1, same, other)
+    pairs = Revisits(none, 0.0, 0.0, 1, same, other)
     places, keys = {k: k for k in range(n)}, np.arange(n)
 
     def off(poses):
@@ -151,6 +151,20 @@ def test_a_drive_that_never_comes_back_is_told_so(tmp_path):
     assert (
         json.loads((tmp_path / "out" / "tune.json").read_text())["after"]["inconsistency"] is None
     )
+
+
+def test_a_picture_that_never_changes_is_one_line(driven):
+    same = [frame._replace(image=driven.frames[0].image) for frame in driven.frames]
+    with pytest.raises(SourceError, match="only 0 of 561 pictures differ"):
+        key_frames(driven.__class__(same, driven.factor, driven.size, 0))
+
+
+def test_a_camera_that_hardly_moves_is_told_so(driven):
+    noise = np.random.default_rng(0).integers(0, 3, (120, *driven.frames[0].image.shape))
+    pictures = driven.frames[0].image + noise.astype(np.uint8)
+    revisits = find_revisits(pictures)
+    assert len(revisits.same) < 30
+    assert len(revisits.other) > 0
 
 
 def test_regions_are_in_pixels_of_the_source():

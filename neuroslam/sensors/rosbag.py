@@ -4,6 +4,7 @@
 each kind is taken, or the one named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -163,8 +164,9 @@ class _BagTopic(Source):
     def _begin(self) -> None:
         """Forget what an earlier reading has left."""
 
+    @abstractmethod
     def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
-        raise NotImplementedError
+        """Make a frame of a message of the first topic."""
 
     def _also(self, message: Any) -> None:  # noqa: ANN401
         """Take in a message of another topic than the first."""

@@ -107,8 +107,16 @@ def key_frames(drive: Drive) -> np.ndarray:
 
     Returns:
         Their numbers in the drive, rising; at most 1500.
+
+    Raises:
+        SourceError: If the picture hardly ever changes.
     """
     pictures = drive.pictures
     change = np.array([cv2.absdiff(before, now).mean() for before, now in pairwise(pictures)])
     moving = 1 + np.flatnonzero(change > 0.2 * np.median(change))
+    if len(moving) < _MIN_FRAMES // 2:
+        raise SourceError(
+            f"only {len(moving)} of {len(pictures)} pictures differ from the one before; tuning "
+            "needs a drive"
+        )
     return moving[:: -(-len(moving) // _MAX_KEYS)]

@@ -35,7 +35,6 @@ class Revisits(NamedTuple):
     """Pairs of key frames that show one place, and pairs that do not.
 
     Attributes:
-        differences: :math:`D`, mean grey difference of key frames, ``(n, n)``.
         scores: :math:`S`, ``(n, n)``; the lower the more alike; ``inf`` within ``gap``.
         limit: Score below which two stretches show one place.
         doubt: Score above which they do not; between the two, who knows.
@@ -44,7 +43,6 @@ class Revisits(NamedTuple):
         other: As many pairs, or some, of two places.
     """
 
-    differences: np.ndarray
     scores: np.ndarray
     limit: float
     doubt: float
@@ -75,7 +73,7 @@ def find_revisits(pictures: np.ndarray, n_other: int = 2000) -> Revisits:
     lag_means = np.array([np.diagonal(apart, lag).mean() for lag in range(n // 2)])
     unlike = 0.9 * np.median(apart)
     decorrelated = int(np.argmax(lag_means > unlike)) if (lag_means > unlike).any() else n // 2
-    gap = max(3 * HALF_LENGTH, 2 * decorrelated)
+    gap = min(max(3 * HALF_LENGTH, 2 * decorrelated), n // 3)
     spread = apart.std(axis=1, keepdims=True) + 1e-9
     relative = (apart - apart.mean(axis=1, keepdims=True)) / spread
     relative = (0.5 * (relative + relative.T)).astype(np.float32)
@@ -93,9 +91,8 @@ def find_revisits(pictures: np.ndarray, n_other: int = 2000) -> Revisits:
     middling = np.median(scores[np.isfinite(scores)]) if np.isfinite(scores).any() else 0.0
     i, j = np.nonzero(np.triu(np.isfinite(scores) & (scores > middling)))
     some = np.linspace(0, len(i) - 1, min(n_other, len(i))).astype(int)
-    return Revisits(
-        apart, scores, float(limit), float(doubt), gap, same, np.stack([i[some], j[some]], axis=1)
-    )
+    other = np.stack([i[some], j[some]], axis=1)
+    return Revisits(scores, float(limit), float(doubt), gap, same, other)
 
 
 def pairwise(templates: np.ndarray, shift: int = 3) -> np.ndarray:
