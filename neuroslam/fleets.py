@@ -28,9 +28,8 @@ from neuroslam.run_files import (
     true_poses,
     write_text,
 )
-from neuroslam.runs import run
 from neuroslam.sensors.open import absolute_spec
-from neuroslam.sweeps import claim, told
+from neuroslam.sweeps import claim, run_one, told
 
 REPORT = "fleet.json"
 MERGED = "merged"
@@ -169,18 +168,8 @@ def fleet(
 
 
 def _map(order: _Session) -> dict[str, Any]:
-    summary = run(
-        order.source,
-        order.folder,
-        order.config,
-        preset=order.preset,
-        on_bad_frame=order.on_bad_frame,
-        tensorboard=False,
-        overwrite=True,  # whether it may was asked before; a process that died left something
-    )
-    if summary.interrupted:
-        raise KeyboardInterrupt
-    return summary.to_dict() | {"error": summary.failure}
+    given = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    return run_one(order.source, order.folder, order.config, **given)
 
 
 def _merge(pair: _Pair) -> list[dict[str, Any]]:

@@ -260,17 +260,22 @@ def claim(out: Path, summary: str, overwrite: bool) -> None:
 
 def _map(order: _Order) -> dict[str, Any]:
     trial = order.trial
-    summary = run(
-        trial.source,
-        order.out / trial.name,
-        trial.config,
-        preset=order.preset,
-        start=order.start,
-        stop=order.stop,
-        on_bad_frame=order.on_bad_frame,
-        tensorboard=False,
-        overwrite=True,  # whether it may was asked before; a process that died left something
-    )
+    given = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    given |= {"start": order.start, "stop": order.stop}
+    return run_one(trial.source, order.out / trial.name, trial.config, **given)
+
+
+def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Make one run of many; arguments are those of :func:`neuroslam.runs.run`.
+
+    Returns:
+        Its figures, and ``error``, empty where it went well.
+
+    Raises:
+        KeyboardInterrupt: If it is interrupted.
+    """
+    # Whether it may overwrite was asked before; a process that died has left something.
+    summary = run(source, folder, config, tensorboard=False, overwrite=True, **given)
     if summary.interrupted:
         raise KeyboardInterrupt
     return summary.to_dict() | {"error": summary.failure}

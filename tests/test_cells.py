@@ -422,3 +422,10 @@ def test_a_silent_brain_in_a_batch_is_refused():
     tori[0, 1, 1, 1] = 1.0
     with pytest.raises(MapError, match="no activity in a brain of the batch"):
         to_packets(tori)
+
+
+def test_a_nudge_moves_every_brain_of_a_batch_as_it_moves_one():
+    one, batch = PoseCellNetwork(PoseCellConfig()), PoseCellNetwork(PoseCellConfig(), batch=2)
+    for cells in (one, batch):
+        cells.nudge(0.4, -1.2, 2.5)
+    torch.testing.assert_close(batch.activity, one.activity.expand(2, -1, -1, -1))

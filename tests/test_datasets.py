@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from neuroslam.cli import main
-from neuroslam.errors import SourceError
+from neuroslam.errors import RunError, SourceError
+from neuroslam.report import write_report
 from neuroslam.sensors import camera, open_source
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.sensors.rosbag import full_turn
+from neuroslam.tuning import tune
 
 N = 12
 EPOCH_S = 1_305_031_102.25
@@ -173,7 +175,7 @@ def test_a_damaged_dataset_is_one_line(make, damage, said, tmp_path):
 # --- bags ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=["ros1.bag", "ros2"])
+@pytest.fixture(params=["ros1.bag", "ros2", "ros2_mcap"])
 def bag(request, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra rosbag")
     from rosbags.rosbag1 import Writer as Writer1
@@ -223,9 +225,8 @@ def bag(request, tmp_path):
             ranges, np.zeros(0, np.float32),
         )  # fmt: skip
 
-    writer = (
-        Writer1(path) if first else Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
-    )
+    kept = StoragePlugin.MCAP if "mcap" in path.name else StoragePlugin.SQLITE3
+    writer = Writer1(path) if first else Writer2(path, version=9, storage_plugin=kept)
     messages = [(TIMES[k], "/front", image(k)) for k in range(N)]
     messages += [(TIMES[k] + 1e-4, "/packed", compressed(k)) for k in range(N)]
     for time_s in np.arange(TIMES[0], TIMES[-1], 0.05):
@@ -274,8 +275,19 @@ def test_a_bag_is_mapped(bag, tmp_path):
                  "--set", "view.template_width=16"]) == 0  # fmt: skip
 
 
+def storage(bag):
+    """Return the file that holds the messages."""
+    return bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+
+
+def test_the_file_alone_gives_what_its_folder_gives(bag):
+    assert storage(bag).suffix in (".bag", ".mcap" if "mcap" in bag.name else ".db3")
+    alone, whole = (list(open_source(path)) for path in (storage(bag), bag))
+    assert [frame.time_s for frame in alone] == [frame.time_s for frame in whole]
+
+
 def test_a_broken_bag_is_one_line(bag):
-    damaged = bag if bag.is_file() else next(bag.glob("*.db3"))
+    damaged = storage(bag)
     damaged.write_bytes(damaged.read_bytes()[:100])
     with pytest.raises(SourceError, match="is not a whole ROS bag") as caught:
         open_source(bag)
@@ -327,6 +339,17 @@ def test_a_camera_gives_pictures_at_the_times_they_come(monkeypatch):
     assert times[0] > 1.7e9
     assert [frame.index for frame in source.frames(7, 9)] == [7, 8]
     assert absolute_spec("camera:0") == "camera:0"
+
+
+def test_what_a_camera_showed_is_not_looked_for_later(monkeypatch, tmp_path):
+    monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
+    small = ["--set", "view.template_width=16", "--set", "odometry.max_shift_px=8"]
+    out = tmp_path / "out"
+    assert main(["run", "camera:0", "-o", str(out), "--stop", "5", "--no-tensorboard", *small]) == 0
+    page = write_report(out).read_text()
+    assert "a live camera shows something else by now" in page
+    with pytest.raises(RunError, match="camera:0: is live; tuning looks several times"):
+        tune("camera:0", tmp_path / "tuned")
 
 
 def test_a_camera_that_stops_or_is_not_there_is_one_line(monkeypatch, tmp_path, capsys):

@@ -181,7 +181,11 @@ class PoseCellNetwork(Population):
 
     def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
         """Move and turn the belief a little, as something else has corrected the pose."""
-        self.packet = path_integrate(self.packet, 0.0, turn_cells, (dx_cells, dy_cells))
+        if self.batch is None:
+            self.packet = path_integrate(self.packet, 0.0, turn_cells, (dx_cells, dy_cells))
+        else:
+            aside = torch.tensor([dx_cells, dy_cells]).expand(self.batch, 2)
+            self.packet = move_all(self.packet, 0.0, turn_cells, aside)
 
     def _measure_slip(
         self, before: PoseEstimate | Tensor, distance: float | Tensor, turn: float | Tensor

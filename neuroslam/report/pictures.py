@@ -119,7 +119,10 @@ def _from_source(
     found: dict[int, bytes] = {}
     seen, fault = 0, ""
     try:
-        for frame in _frames(open_source(spec, frame_rate_hz), numbers):
+        source = open_source(spec, frame_rate_hz)
+        if source.live:
+            return found, f"No pictures of {name}: a live camera shows something else by now."
+        for frame in _frames(source, numbers):
             seen += 1
             if frame.image is not None:
                 found[frame.index] = thumbnail(frame.image)

@@ -31,6 +31,7 @@ class CameraSource(Source):
         self.name = f"camera:{device}"
         self.device: int | str = int(device) if device.isdecimal() else device
         self.n_frames = None
+        self.live = True
         if device == "":
             raise SourceError("camera: has no number; expected camera:0, or an address")
         capture = self._capture()

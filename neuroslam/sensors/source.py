@@ -18,11 +18,13 @@ class Source(ABC):
         name: How the source is called in reports.
         n_frames: How many frames it has, or ``None`` if only reading it to the end would tell.
         frame_rate_hz: Frames per second, or ``None`` if unknown.
+        live: Whether it shows what is there now, so that its frames cannot be read a second time.
     """
 
     name: str
     n_frames: int | None
     frame_rate_hz: float | None
+    live: bool = False
 
     @abstractmethod
     def frames(

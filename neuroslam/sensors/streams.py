@@ -55,6 +55,7 @@ class Streams(Source):
         self.camera, self.motion = camera, motion
         self.n_frames = None
         self.frame_rate_hz = None
+        self.live = camera.live or motion.live
         spans = [_span(camera, first), _span(motion, second)]
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
             raise self._apart(*spans)

@@ -27,8 +27,9 @@ def plot_tuning(tuning: "Tuning", name: str) -> Figure:
         _draw_templates(axes[0, 1], tuning)
         _draw_field_of_view(axes[0, 2], tuning)
         _draw_maps(axes[1, 0], tuning)
-        _draw_track(axes[1, 1], tuning.before, "Before")
-        _draw_track(axes[1, 2], tuning.after, "Found")
+        unit = "m, not to scale" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
+        _draw_track(axes[1, 1], tuning.before, "Before", unit)
+        _draw_track(axes[1, 2], tuning.after, "Found", unit)
     return figure
 
 
@@ -50,6 +51,11 @@ def _draw_differences(axes: Axes, tuning: "Tuning") -> None:
 
 
 def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
+    axes.set(title="Templates: telling places apart", xlabel="average precision", xlim=(0.0, 1.0))
+    if not len(tuning.revisits.same):
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "no place was seen twice", transform=axes.transAxes, ha="center")
+        return
     seen: dict[str, float] = {}
     for score in tuning.views:
         config = score.config
@@ -61,7 +67,6 @@ def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
     ordered = sorted(seen.items(), key=lambda item: item[1])
     axes.barh([label for label, _ in ordered], [value for _, value in ordered], height=0.7,
               color=[MAP if label == chosen else "#b9cfe0" for label, _ in ordered])  # fmt: skip
-    axes.set(title="Templates: telling places apart", xlabel="average precision", xlim=(0.0, 1.0))
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", labelsize=7)
 
@@ -95,13 +100,13 @@ def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
     axes.legend()
 
 
-def _draw_track(axes: Axes, trial: "Trial", title: str) -> None:
+def _draw_track(axes: Axes, trial: "Trial", title: str, unit: str) -> None:
     off = trial.inconsistency
     told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
     axes.plot(*trial.track_xy.T, color=MAP, lw=0.6)
     axes.plot(*trial.track_xy[0], "o", color=OTHER, ms=5, label="start")
     axes.plot(*trial.track_xy[-1], "s", color=INK, ms=4, label="end")
-    axes.set(title=f"{title}: {trial.n_places} places{told}", xlabel="x (m, not to scale)",
-             ylabel="y (m, not to scale)")  # fmt: skip
+    axes.set(title=f"{title}: {trial.n_places} places{told}", xlabel=f"x ({unit})",
+             ylabel=f"y ({unit})")  # fmt: skip
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend()

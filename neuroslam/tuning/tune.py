@@ -127,7 +127,7 @@ def tune(
 
     Raises:
         SourceError: If the source cannot be read, or has fewer than a hundred pictures.
-        RunError: If the brain has no pose cells, or ``out`` cannot be written.
+        RunError: If the source is live, the brain has no pose cells, or ``out`` cannot be written.
     """
     out, config = Path(out), config or BrainConfig()
     if not config.has("pose"):
@@ -139,6 +139,8 @@ def tune(
     if (out / "config.toml").exists() and not overwrite:
         raise RunError(f"{out}: holds a config.toml already; take another folder or --overwrite")
     opened = open_source(source, config.frame_rate_hz)
+    if opened.live:
+        raise RunError(f"{opened.name}: is live; tuning looks several times, so tune a recording")
     tell = on_stage or (lambda stage: None)
     with one_thread():
         tuning = _tune(opened, config, stop, tell)
