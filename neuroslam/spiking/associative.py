@@ -84,7 +84,7 @@ class AssociativeMap(Running):
         n = config.neurons
         near = None
         if keys is not None:
-            near = keys[torch.arange(n) % len(keys)].unsqueeze(0).float()
+            near = keys[torch.arange(n) % len(keys)].unsqueeze(0).to(torch.get_default_dtype())
             near = near / near.norm(dim=-1, keepdim=True)
         tuning = sample_tuning(1, n, n_key, neurons, draw, 1.0, near, config.intercept)
         self.memory = NeuronArray(tuning, neurons, time_step_s, draw, batch)

@@ -110,7 +110,7 @@ class VectorPopulation(Running):
     ) -> "VectorPopulation":
         """Place cells: each fires at one place of the space; arguments as of the others."""
         draw = torch.Generator().manual_seed(seed)
-        region = space.bounds_m.float()
+        region = space.bounds_m.to(torch.get_default_dtype())
         encoders = space.encode_fourier(_uniform(region, neurons, draw)).detach()
         return cls(encoders, region, space, config, time_step_s, draw, batch)
 
@@ -126,7 +126,7 @@ class VectorPopulation(Running):
     ) -> "VectorPopulation":
         """Grid cells: each knows the waves of one module; arguments as of the others."""
         draw = torch.Generator().manual_seed(seed)
-        region = space.bounds_m.float()
+        region = space.bounds_m.to(torch.get_default_dtype())
         modules = space.grid_modules
         full = space.encode_fourier(_uniform(region, neurons, draw)).detach()
         mine = torch.zeros(full.shape, dtype=torch.bool)

@@ -122,7 +122,7 @@ class SSPSLAM(Running):
         neurons = c.neurons
         if c.tier == "rate":
             neurons = neurons.model_copy(update={"model": "lif_rate"})
-        self.register_buffer("pointers", pointers.detach().float().clone())
+        self.register_buffer("pointers", pointers.detach().to(torch.get_default_dtype(), copy=True))
         if c.tier == "algebraic":
             self.integrator = AlgebraicIntegrator(space, c.integrator, dt, seed, batch)
             self.map = AlgebraicMap(n_key, n, c.map, dt, batch)
@@ -289,7 +289,7 @@ class SSPSLAM(Running):
     def _place_memory(self, neurons: NeuronConfig, seed: int) -> AssociativeMap:
         """A memory whose keys are places: it fires as place cells do."""
         c, draw = self.config, torch.Generator().manual_seed(seed)
-        low, high = self.space.bounds_m.T.float()
+        low, high = self.space.bounds_m.T.to(self.pointers)
         at = low + (high - low) * torch.rand(c.map.neurons, len(low), generator=draw)
         n, keys = self.space.n_features, self.space.encode(at).detach()
         # An area is like each of its places a little: cells must answer to that.
