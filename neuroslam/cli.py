@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 from typer.core import TyperGroup
 
-from neuroslam.errors import NeuroslamError
+from neuroslam.errors import ConfigError, NeuroslamError
 from neuroslam.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
@@ -474,16 +474,32 @@ def experiment_command(
     ] = None,
     jobs: Jobs = None,
     ray: RayAddress = None,
+    network: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="view-matching: a network of torchvision too, with the weights of FILE; "
+            "repeatable.",
+        ),
+    ] = None,
 ) -> int:
     """Repeat an experiment of a paper."""
     from neuroslam.experiments import run_experiment
 
-    rows = run_experiment(name, data, out, jobs, ray)
+    networks = dict(_name_and_file(text) for text in network or [])
+    rows = run_experiment(name, data, out, jobs, ray, networks)
     few = len({key for row in rows for key in row}) <= 9
     for table in [_down(rows, name)] if few else _across(rows, name):
         console.print(table)
     console.print(f"Written: {out}")
     return 0
+
+
+def _name_and_file(text: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not (name and equals and file):
+        raise ConfigError(f"--network {text!r}: expected NAME=FILE, as resnet18.layer3=weights.pth")
+    return name, Path(file)
 
 
 def _down(rows: list[dict[str, Any]], title: str) -> Table:

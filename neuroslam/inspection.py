@@ -75,7 +75,11 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("extent", f"{width:.2f} m x {height:.2f} m"),
         ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
-        ("view", f"{view.template_width} x {view.template_height} px, threshold {view.threshold}"),
+        (
+            "view",
+            f"{view.template_width} x {view.template_height} px of {view.features}, "
+            f"threshold {view.threshold}",
+        ),
         ("cells", "+".join(config.cells)),
         ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
     ]

@@ -159,7 +159,8 @@ def plot_precision_recall(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -
             axes.plot(recall, precision, dash, color=colour, lw=1.8, label=name, clip_on=False)
         axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="recall", ylabel="precision", aspect="equal")
         write_title(axes, "Recognised places", counted(len(curves), "method"))
-        legend_below(axes, columns=min(3, max(1, len(curves))))
+        longest = max(map(len, curves), default=1)
+        legend_below(axes, columns=max(1, min(3, len(curves), 66 // longest)))
     return figure
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
 from neuroslam.config import (
@@ -142,6 +143,7 @@ def run(
     overwrite: bool = False,
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
+    features: nn.Module | None = None,
 ) -> RunSummary:
     """Map a source and write the run's files into a folder.
 
@@ -158,6 +160,7 @@ def run(
         overwrite: Replace the files of an earlier run in ``out``.
         on_step: Called after each frame, e.g. to show progress.
         on_start: Called once, with the number of the frame to stop before; ``None``: unknown.
+        features: Network that makes views, where ``config.view.features`` is ``"module"``.
 
     Returns:
         What was done; a bad frame under ``stop`` ends the run, whose files are still written,
@@ -182,7 +185,7 @@ def run(
     opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(f"{source}: has {opened.n_frames} frames, none from --start {start} on")
-    brain, summary = NavigationBrain(config), RunSummary()
+    brain, summary = NavigationBrain(config, features=features), RunSummary()
     brain.about = (plan.name, preset, recorded(plan.source))
     for one in stored:
         brain.store(one)
@@ -205,6 +208,7 @@ def resume(
     tensorboard: bool = True,
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
+    features: nn.Module | None = None,
 ) -> RunSummary:
     """Go on where a run stopped; its files end up equal to those of an uncut run.
 
@@ -214,6 +218,7 @@ def resume(
         tensorboard: Append to ``events/`` too.
         on_step: Called after each frame.
         on_start: As for :func:`run`.
+        features: The network that makes views, where one was passed to the run.
 
     Raises:
         RunError: If the folder holds no run, parts of it are missing, or it is past ``stop``.
@@ -221,7 +226,7 @@ def resume(
     """
     out = Path(out)
     plan = replace(read_plan(out), stop=stop)
-    brain = load_brain(out / "brain.safetensors")
+    brain = load_brain(out / "brain.safetensors", features=features)
     seen, first = brain.clock.frames_seen, brain.clock.frame + 1
     if stop is not None and stop < first:
         raise RunError(f"{out}: is at frame {first} already; --stop {stop} is behind that")

@@ -40,6 +40,12 @@ class OdometryConfig(Section):
 class ViewConfig(Section):
     """Local view cells: how a picture becomes a template and when two are the same place."""
 
+    features: str = Field(
+        "grey",
+        description="what a template is made of: grey; a network of torchvision and its layer, as "
+        "resnet18.layer3; module: one passed in Python",
+    )
+    weights: str | None = Field(None, description="file of the named network's state_dict")
     crop: Region | None = Field(None, description="x_min, x_max, y_min, y_max in px; none: all")
     template_width: int = Field(60, ge=2, description="px; larger: tells more places apart")
     template_height: int = Field(10, ge=1, description="px")
@@ -61,6 +67,18 @@ class ViewConfig(Section):
     precision: Literal["uint8", "float64"] = Field(
         "uint8", description="how a template is kept: one byte a pixel, or eight"
     )
+
+    @model_validator(mode="after")
+    def _weights_are_of_a_named_network(self) -> Self:
+        named = self.features not in ("grey", "module")
+        if named and self.weights is None:
+            raise ValueError(
+                f"features {self.features} needs weights: a file that holds the network's "
+                "state_dict"
+            )
+        if self.weights is not None and not named:
+            raise ValueError(f"weights are of a named network, and features is {self.features}")
+        return self
 
     @model_validator(mode="after")
     def _shift_leaves_columns(self) -> Self:

@@ -12,7 +12,7 @@ from torch import nn
 from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.limits import WINDOW, elsewhere, tolerance
 from neuroslam.brain.matching import shared_history
-from neuroslam.brain.merge import Match, differing_keys, merge
+from neuroslam.brain.merge import Match, differing, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.boundary import check_walls
@@ -41,6 +41,7 @@ from neuroslam.types import (
     Velocity,
     ViewMatch,
 )
+from neuroslam.view.features import view_encoder
 from neuroslam.view.templates import LocalViewCells
 
 _COMPASS_S = 2.0  # over which the noise of a compass is averaged
@@ -75,6 +76,8 @@ class NavigationBrain(nn.Module):
 
     Args:
         config: Every parameter; the defaults suit a forward camera on a small robot.
+        features: Network that makes views, where ``config.view.features`` is ``"module"``; see
+            :class:`~neuroslam.view.features.FeatureEncoder`.
 
     Example:
         >>> from neuroslam.types import Frame, Velocity
@@ -84,9 +87,12 @@ class NavigationBrain(nn.Module):
         'create'
     """
 
-    def __init__(self, config: BrainConfig | None = None) -> None:
+    def __init__(
+        self, config: BrainConfig | None = None, *, features: nn.Module | None = None
+    ) -> None:
         super().__init__()
         self.config = config or BrainConfig()
+        self._encoder = view_encoder(self.config.view, features)
         self.about = ("", "", "")  # source, preset and date of the next session
         self._detects = self.config.sessions.carried == "detect"
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
@@ -99,7 +105,7 @@ class NavigationBrain(nn.Module):
         """Start with an empty map."""
         config, cells = self.config, self.config.pose_cells
         self.odometry = VisualOdometry(config.odometry)
-        self.view = LocalViewCells(config.view)
+        self.view = LocalViewCells(config.view, self._encoder)
         self.pose_cells = PoseCellNetwork(cells)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
@@ -303,10 +309,10 @@ class NavigationBrain(nn.Module):
         Raises:
             ConfigError: If views or pose cells of the two were made with different configs.
         """
-        differing = differing_keys(self.config, other.config)
-        if differing:
+        apart = differing(self, other)
+        if apart:
             raise ConfigError(
-                f"a stored map was made with another config: {'; '.join(differing)}; "
+                f"a stored map was made with another config: {'; '.join(apart)}; "
                 "run with the stored map's config"
             )
         for one in (other, *other.stored):
@@ -447,6 +453,7 @@ class NavigationBrain(nn.Module):
         merged.sessions.merges[-1] = report.to_dict()
         for name, part in merged.populations().items():
             setattr(self, name, part)
+        self.view.encoder = self._encoder
         self.stored = nn.ModuleList(rest)
         rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
         for i, (alike, agreed) in enumerate(rows):

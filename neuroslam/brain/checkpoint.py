@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.brain.sessions import Session, session_id
@@ -44,14 +44,20 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
     return config, tensors
 
 
-def load_brain(path: str | Path) -> NavigationBrain:
+def load_brain(path: str | Path, *, features: nn.Module | None = None) -> NavigationBrain:
     """Load a brain; going on with it is bit-equal to never having stopped.
 
+    Args:
+        path: The file.
+        features: The network that makes its views, where it was passed to the brain that was
+            saved: files hold maps, and of a network only which it was.
+
     Raises:
+        ConfigError: If a network is passed to a brain that has another.
         CheckpointError: If the file cannot be used; one line says why.
     """
     config, tensors = read_checkpoint(path)
-    brain = NavigationBrain(config)
+    brain = NavigationBrain(config, features=features)
     try:
         brain.load_state_dict(tensors)
     except (RuntimeError, ValueError, KeyError, TypeError) as error:

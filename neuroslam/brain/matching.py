@@ -6,7 +6,7 @@ import numpy as np
 
 from neuroslam.brain.landmark_matching import match_landmarks
 from neuroslam.brain.limits import elsewhere, far_off, tolerance
-from neuroslam.brain.merge import Match, differing_keys
+from neuroslam.brain.merge import Match, differing
 from neuroslam.brain.sessions import session_name
 from neuroslam.brain.wall_matching import match_walls
 from neuroslam.mapping.experience import ExperienceMap
@@ -43,10 +43,10 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
         loaded: One brain; it is not altered.
         partial: The other, whose config says how many must agree; it is not altered.
     """
-    differing = differing_keys(loaded.config, partial.config)
-    if differing:
+    apart = differing(loaded, partial)
+    if apart:
         return Found(
-            None, f"views or pose cells were made with different configs: {'; '.join(differing)}"
+            None, f"views or pose cells were made with different configs: {'; '.join(apart)}"
         )
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:

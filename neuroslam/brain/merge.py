@@ -141,7 +141,9 @@ class MergeReport:
 
 
 def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
-    """Name the parameters of views and pose cells that differ: such brains cannot merge.
+    """Name the parameters of views and cells that differ: such brains cannot merge.
+
+    Where the file of a network's weights lies does not matter, see :func:`differing`.
 
     Example:
         >>> differing_keys(BrainConfig(), BrainConfig(view={"threshold": 0.04}))
@@ -160,9 +162,18 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
         differing += [
             f"{section}.{key} is {first[key]} and {second[key]}"
             for key in first
-            if first[key] != second[key]
+            if first[key] != second[key] and (section, key) != ("view", "weights")
         ]
     return differing
+
+
+def differing(one: "NavigationBrain", other: "NavigationBrain") -> list[str]:
+    """Name what keeps two brains from being merged: parameters, or the network of their views."""
+    keys = differing_keys(one.config, other.config)
+    digests = {brain.view.network_digest for brain in (one, other) if brain.view.n}
+    if not keys and len(digests) > 1:
+        keys = [f"the weights of {one.config.view.features!r}, by which views were made"]
+    return keys
 
 
 def make_join(loaded: State, partial: State, match: Match, config: BrainConfig) -> Join:
@@ -362,11 +373,9 @@ def merge(
         [session.name for session in loaded.sessions.sessions],
         [session.name for session in partial.sessions.sessions],
     )  # fmt: skip
-    differing = differing_keys(loaded.config, partial.config)
-    if differing:
-        report.reason = (
-            f"views or pose cells were made with different configs: {'; '.join(differing)}"
-        )
+    apart = differing(loaded, partial)
+    if apart:
+        report.reason = f"views or pose cells were made with different configs: {'; '.join(apart)}"
         return None, report
     report.reason = _beyond_odometry(loaded, partial, match)
     if report.reason:

@@ -1,5 +1,6 @@
 """Experiments of the papers: each writes ``results.json`` and its figures into a folder."""
 
+from collections.abc import Mapping
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -42,7 +43,12 @@ _IF_THERE = {"ssp-localisation": "ssp"}
 
 
 def run_experiment(
-    name: str, data: Path | None, out: Path, jobs: int | None = None, ray: str | None = None
+    name: str,
+    data: Path | None,
+    out: Path,
+    jobs: int | None = None,
+    ray: str | None = None,
+    networks: Mapping[str, Path] | None = None,
 ) -> list[dict[str, Any]]:
     """Run an experiment; returns its rows, with named, unit-carrying keys.
 
@@ -52,10 +58,11 @@ def run_experiment(
         out: Folder to write.
         jobs: As for :func:`neuroslam.parallel.parallel_map`, where it has independent lives.
         ray: The same.
+        networks: ``view.features`` -> file of weights, where it compares views.
 
     Raises:
         RunError: If there is no such experiment, its recording is not there, or it has no
-            independent lives that ``jobs`` or ``ray`` could be used for.
+            independent lives or views that ``jobs``, ``ray`` or ``networks`` could be used for.
     """
     if name not in EXPERIMENTS:
         raise RunError(f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}")
@@ -70,10 +77,14 @@ def run_experiment(
         recordings = Path(data) / folder
         if not recordings.is_dir():
             raise RunError(f"{recordings}: no such recording; say where with --data")
-    experiment, side_by_side = getattr(import_module(module), function), {}
+    experiment, more = getattr(import_module(module), function), {}
+    if networks:
+        if "networks" not in signature(experiment).parameters:
+            raise RunError(f"{name}: compares no views; leave --network out")
+        more["networks"] = networks
     if jobs is not None or ray is not None:
         if "jobs" not in signature(experiment).parameters:
             raise RunError(f"{name}: its lives depend on each other; leave --jobs and --ray out")
-        side_by_side = {"jobs": jobs, "ray": ray}
-    result = experiment(recordings, Path(out), **side_by_side)
+        more |= {"jobs": jobs, "ray": ray}
+    result = experiment(recordings, Path(out), **more)
     return result["rows"]

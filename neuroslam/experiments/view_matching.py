@@ -6,6 +6,7 @@ not marked although they look alike, so pairs fewer than 20 apart count neither 
 """
 
 import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 
-from neuroslam.config import ViewConfig
+from neuroslam.config import ViewConfig, build_config
 from neuroslam.drawing import STYLE, write_title
 from neuroslam.errors import SourceError
 from neuroslam.evaluation.place import (
@@ -41,8 +42,13 @@ NORMALISATIONS: dict[str, dict[str, float]] = {
 SIZES = ((32, 24, 8), (16, 12, 4), (64, 12, 16))
 """Width and height of the templates, columns they may be shifted by; the first is drawn."""
 
+NETWORK_SIZES = ((16, 64, 4), (32, 24, 8))
+"""The same of networks: they have few columns, and a row is not one of the picture."""
 
-def view_matching(data_folder: Path, out_folder: Path) -> dict[str, Any]:
+
+def view_matching(
+    data_folder: Path, out_folder: Path, networks: Mapping[str, str | Path] | None = None
+) -> dict[str, Any]:
     """Match every photograph with the earlier ones, for each kind of template.
 
     Two questions: of all pairs, which show one place (``pairs``)? And, as a robot asks it, is the
@@ -51,47 +57,62 @@ def view_matching(data_folder: Path, out_folder: Path) -> dict[str, Any]:
     Args:
         data_folder: Holds ``frames/`` and ``loop_truth.bmp``.
         out_folder: ``results.json`` and ``pr_curves.png`` are written there.
+        networks: To be compared too: ``view.features`` -> file of the weights.
 
     Returns:
         The content of ``results.json``: ``rows``.
 
     Raises:
         SourceError: If a photograph or the truth cannot be read, or they do not fit.
+        ConfigError: If a network cannot be loaded.
     """
     images = [frame.image for frame in open_source(Path(data_folder) / "frames").frames()]
     truth = read_truth(Path(data_folder) / "loop_truth.bmp", len(images))
     rows, curves = [], {}
-    for width, height, shift in SIZES:
-        for name, normalisation in NORMALISATIONS.items():
-            config = ViewConfig(
-                template_width=width, template_height=height, shift_match=shift, **normalisation
-            )
-            distances = distance_matrix(images, config)
-            pairs, nearest = pair_curve(distances, truth), nearest_curve(distances, truth)
-            rows.append(
-                {
-                    "templates": name,
-                    "width_px": width,
-                    "height_px": height,
-                    "shift_columns": shift,
-                    "pairs_average_precision": average_precision(pairs),
-                    "nearest_average_precision": average_precision(nearest),
-                    "nearest_recall_at_full_precision": recall_at_full_precision(nearest),
-                }
-            )
-            if (width, height, shift) == SIZES[0]:
-                precision = average_precision(nearest)
-                curves[f"{name} {precision:.2f}"] = (nearest.precision, nearest.recall)
+    for name, drawn, config in _kinds(networks or {}):
+        distances = distance_matrix(images, config)
+        pairs, nearest = pair_curve(distances, truth), nearest_curve(distances, truth)
+        rows.append(
+            {
+                "templates": name,
+                "width_px": config.template_width,
+                "height_px": config.template_height,
+                "shift_columns": config.shift_match,
+                "pairs_average_precision": average_precision(pairs),
+                "nearest_average_precision": average_precision(nearest),
+                "nearest_recall_at_full_precision": recall_at_full_precision(nearest),
+            }
+        )
+        if drawn:
+            size = f"{config.template_width}x{config.template_height}"
+            label = f"{name}, {size}, average precision {average_precision(nearest):.2f}"
+            curves[label] = (nearest.precision, nearest.recall)
     result = {"rows": rows, "photographs": len(images), "true_pairs": int(truth.sum())}
     out = Path(out_folder)
     text = json.dumps(result, indent=2) + "\n"
     write_atomically(out / "results.json", lambda file: file.write_text(text, encoding="utf-8"))
     figure = plot_precision_recall(curves)
-    size = f"{SIZES[0][0]}x{SIZES[0][1]} px"
     with mpl.rc_context(STYLE):
-        write_title(figure.axes[0], "Is the nearest view this place?", f"average precision; {size}")
+        write_title(figure.axes[0], "Is the nearest view this place?", "")
     save(figure, out / "pr_curves.png")
     return result
+
+
+def _kinds(networks: Mapping[str, str | Path]) -> Iterator[tuple[str, bool, ViewConfig]]:
+    """Name each kind of template, whether it is drawn, and its config."""
+    kinds: list[tuple[str, tuple, dict[str, Any]]] = [
+        (name, SIZES, normalisation) for name, normalisation in NORMALISATIONS.items()
+    ]
+    for name, weights in networks.items():
+        kinds.append((name, NETWORK_SIZES, {"features": name, "weights": str(weights)}))
+    for name, sizes, values in kinds:
+        for width, height, shift in sizes:
+            size = {"template_width": width, "template_height": height, "shift_match": shift}
+            yield (
+                name,
+                (width, height, shift) == sizes[0],
+                build_config({"view": size | values}).view,
+            )
 
 
 def read_truth(path: Path, n: int) -> np.ndarray:
@@ -108,7 +129,7 @@ def read_truth(path: Path, n: int) -> np.ndarray:
 
 
 def distance_matrix(images: list[np.ndarray], config: ViewConfig) -> np.ndarray:
-    """Compare every picture with every other as the view cells do: ``(n, n)``, grey in [0, 1]."""
+    """Compare every picture with every other as the view cells do: ``(n, n)``, in [0, 1]."""
     cells = LocalViewCells(config)
     views = [cells.encode(image) for image in images]
     for view in views:

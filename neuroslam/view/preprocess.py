@@ -41,13 +41,9 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         >>> (encode(picture, config).template[0] * 255).tolist()
         [4.5, 6.5, 8.5, 10.5]
     """
-    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+    check_picture(image)
+    if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise BadFrame(
-            f"LocalViewCells: picture is {image.dtype} {image.shape}; "
-            "expected uint8, (h, w) or (h, w, 3)"
-        )
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
     contrast = float(view.std()) if config.min_contrast else 1.0
     if config.normalisation:
@@ -57,8 +53,21 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
     return Encoded(view, contrast)
 
 
+def check_picture(image: np.ndarray) -> None:
+    """Check that a picture is ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+
+    Raises:
+        BadFrame: If it is of another type or shape.
+    """
+    if image.dtype != np.uint8 or (image.ndim != 2 and image.shape[2:] != (3,)):
+        raise BadFrame(
+            f"LocalViewCells: picture is {image.dtype} {image.shape}; "
+            "expected uint8, (h, w) or (h, w, 3)"
+        )
+
+
 def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:
-    """Cut ``x_min, x_max, y_min, y_max`` out of a grey picture; ``None`` takes all of it.
+    """Cut ``x_min, x_max, y_min, y_max`` out of a picture; ``None`` takes all of it.
 
     Raises:
         ConfigError: If the region leaves the picture.
@@ -66,7 +75,7 @@ def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndar
     if region is None:
         return image
     x_min, x_max, y_min, y_max = region
-    height, width = image.shape
+    height, width = image.shape[:2]
     if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
         raise ConfigError(
             f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the picture "

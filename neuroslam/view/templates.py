@@ -2,14 +2,16 @@
 
 import numpy as np
 import torch
+from torch import nn
 
 from neuroslam.config import ViewConfig
-from neuroslam.errors import MapError
+from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
 from neuroslam.population import Join, Population, State, renamed
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
-from neuroslam.view.preprocess import encode
+from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
+from neuroslam.view.preprocess import Encoded
 from neuroslam.view.search import (
     Geometry,
     Nearest,
@@ -41,6 +43,7 @@ class LocalViewCells(Population):
 
     Args:
         config: Preprocessing, shifts, threshold, precision.
+        features: The network, or its encoder, where ``config.features`` is ``"module"``.
 
     Example:
         >>> cells = LocalViewCells(ViewConfig(template_width=16, template_height=8, shift_match=2))
@@ -49,9 +52,10 @@ class LocalViewCells(Population):
         (True, 0)
     """
 
-    def __init__(self, config: ViewConfig) -> None:
+    def __init__(self, config: ViewConfig, features: nn.Module | Encoder | None = None) -> None:
         super().__init__()
         self.config = config
+        self.encoder = view_encoder(config, features)
         self.geometry = Geometry.of(config)
         n_pixels = config.template_width * config.template_height
         columns = {
@@ -65,20 +69,39 @@ class LocalViewCells(Population):
             columns["mean"] = ((), torch.float64)
         self.templates = GrowingTable(columns)
         self.last = Scalars(template=NO_TEMPLATE)
+        if config.features != "grey":
+            self.network = Scalars(digest=0)  # of the network that made the templates; 0: none yet
 
     @property
     def n(self) -> int:
         """Number of templates."""
         return self.templates.n
 
+    @property
+    def network_digest(self) -> int:
+        """Tells the networks apart that made the templates; 0: they are of grey, or none yet."""
+        return self.network.digest if self.config.features != "grey" else 0
+
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Make the template of a picture: grey in [0, 1], ``(template_height, template_width)``.
+        """Make the template of a picture: in [0, 1], ``(template_height, template_width)``.
 
         Raises:
             BadFrame: If the picture is not ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-            ConfigError: If crop and template do not fit the picture.
+            ConfigError: If crop and template do not fit the picture, or a network that is to make
+                it cannot be loaded, or is not the one that made the templates.
         """
-        return encode(image, self.config).template
+        return self._encode(image).template
+
+    def _encode(self, image: np.ndarray) -> Encoded:
+        if isinstance(self.encoder, FeatureEncoder):
+            if not self.n:
+                self.network.digest = self.encoder.digest
+            elif self.network.digest != self.encoder.digest:
+                raise ConfigError(
+                    f"view.features = {self.config.features!r}: the {self.n} views of the map were "
+                    "made with other weights; give those, or begin a new map"
+                )
+        return self.encoder(image)
 
     def template_image(self, template: int) -> np.ndarray:
         """Return a template as a grey picture, ``uint8``, ``(template_height, template_width)``.
@@ -176,7 +199,7 @@ class LocalViewCells(Population):
             BadFrame: If the picture is of another type or shape.
             ConfigError: If crop and template do not fit the picture.
         """
-        view, contrast = encode(image, self.config)
+        view, contrast = self._encode(image)
         return None if contrast < self.config.min_contrast else view
 
     def recognise(self, view: np.ndarray) -> ViewMatch:
@@ -215,7 +238,8 @@ class LocalViewCells(Population):
             for name, column in partial.items()
             if name.startswith("templates.")
         }
-        return merged | {"last.template": renamed(partial["last.template"], join.views)}
+        now = {name: v for name, v in partial.items() if name.startswith("network.")}
+        return merged | now | {"last.template": renamed(partial["last.template"], join.views)}
 
     def _check(self, view: np.ndarray) -> None:
         size = (self.geometry.height, self.geometry.width)
