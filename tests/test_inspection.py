@@ -105,7 +105,7 @@ def test_what_is_told_of_a_brain_is_what_it_holds(joined):
     width, height = np.ptp(brain.map.poses[:, :2], axis=0)
     assert told["extent"] == f"{width:.2f} m x {height:.2f} m"
     assert told["length of all links"] == f"{brain.map.links.distance_m.sum():.2f} m"
-    assert told["view"] == "60 x 10 px, threshold 0.05"
+    assert told["view"] == "60 x 10 px of grey, threshold 0.05"
     assert told["pose cells"] == "21 x 21 x 36, 0.25 m"
     first, second = brain.sessions.sessions
     [merge] = brain.sessions.merges
