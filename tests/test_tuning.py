@@ -5,9 +5,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import nn
 
+from neuroslam.brain import NavigationBrain
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, build_config, read_config_file, read_preset
 from neuroslam.errors import RunError, SourceError
@@ -140,6 +143,28 @@ def test_tuning_twice_gives_the_same_config(tuned, tmp_path):
     tune(PICTURES, tmp_path / "again")
     for name in ("config.toml", "tune.json"):
         assert (tmp_path / "again" / name).read_bytes() == (tuned[1] / name).read_bytes()
+
+
+def test_views_by_a_network_are_tuned_too_and_the_run_has_the_map_that_was_judged(tmp_path):
+    """Each frame is looked at once; what the search saw is what a brain with the network sees."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = nn.Sequential(nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 16, 3, 2, 1))
+    looked = []
+    network.register_forward_hook(lambda *_: looked.append(1))
+    size = {"template_width": 16, "template_height": 32, "shift_match": 2}
+    config = BrainConfig(view={"features": "module"} | size, max_gap_s=1e9)
+    tuning = tune(PICTURES, tmp_path / "out", config, features=network)
+    assert len(looked) == 561
+    assert tuning.after.inconsistency < 0.03
+    assert tuning.after.inconsistency < tuning.before.inconsistency + 0.005
+    assert [score.config.features for score in tuning.views] == ["module", "grey"]
+    assert tuning.config.view.features == "module"
+    assert tuning.config.view.template_width == 16
+    brain = NavigationBrain(tuning.config, features=network)
+    for frame in open_source(PICTURES).frames():
+        brain(frame)
+    assert (brain.view.n, brain.map.n) == (tuning.after.n_views, tuning.after.n_places)
 
 
 def test_a_drive_that_never_comes_back_is_told_so(tmp_path):

@@ -41,7 +41,7 @@ from neuroslam.types import (
     Velocity,
     ViewMatch,
 )
-from neuroslam.view.features import view_encoder
+from neuroslam.view.features import Encoder, view_encoder
 from neuroslam.view.templates import LocalViewCells
 
 _COMPASS_S = 2.0  # over which the noise of a compass is averaged
@@ -88,7 +88,7 @@ class NavigationBrain(nn.Module):
     """
 
     def __init__(
-        self, config: BrainConfig | None = None, *, features: nn.Module | None = None
+        self, config: BrainConfig | None = None, *, features: nn.Module | Encoder | None = None
     ) -> None:
         super().__init__()
         self.config = config or BrainConfig()

@@ -45,7 +45,7 @@ def _draw_differences(axes: Axes, tuning: "Tuning") -> None:
             axes.hist(values, bins, weights=weights, histtype="step", lw=1.6, color=colour,
                       label=label)  # fmt: skip
     axes.axvline(threshold, color=INK, ls="--", lw=1.0, label=f"threshold {threshold:g}")
-    axes.set(title="How different two views are", xlabel="mean difference of grey (0 to 1)",
+    axes.set(title="How different two views are", xlabel="mean difference of templates (0 to 1)",
              ylabel="pairs (%)", xlim=(0.0, top))  # fmt: skip
     axes.legend()
 
@@ -61,7 +61,8 @@ def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
         config = score.config
         rows = "all rows" if config.crop is None else f"rows {config.crop[2]} to {config.crop[3]}"
         patch = f", patch {config.patch_radius}" if config.patch_radius else ""
-        label = f"{config.template_width} x {config.template_height}, {rows}{patch}"
+        of = "" if config.features == "grey" else f"{config.features}, "
+        label = f"{of}{config.template_width} x {config.template_height}, {rows}{patch}"
         seen.setdefault(label, score.average_precision)
     chosen = next(iter(seen))
     ordered = sorted(seen.items(), key=lambda item: item[1])

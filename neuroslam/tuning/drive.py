@@ -10,6 +10,9 @@ from neuroslam.errors import BadFrame, SourceError
 from neuroslam.sections import Region
 from neuroslam.sensors import Source
 from neuroslam.types import Frame
+from neuroslam.view.features import FeatureEncoder
+from neuroslam.view.preprocess import Encoded
+from neuroslam.view.templates import to_bytes
 
 MAX_FRAMES = 12_000
 """A longer drive is tuned on its first so many frames."""
@@ -28,17 +31,24 @@ class Drive:
         factor: How many pixels of the source a pixel has, each way.
         size: Width and height of the source's pictures, px.
         unusable: Frames that were left out.
+        views: Templates that a network made of the source's own pictures, by the frames' indices,
+            rounded to bytes; ``None``: templates are of grey.
     """
 
     frames: list[Frame]
     factor: int
     size: tuple[int, int]
     unusable: int
+    views: dict[int, Encoded] | None = None
 
     @property
     def pictures(self) -> np.ndarray:
         """All pictures, ``uint8``, ``(n, h, w)``."""
         return np.stack([frame.image for frame in self.frames])
+
+    def templates(self, keys: np.ndarray) -> np.ndarray:
+        """Return what the network made of some frames, in [0, 1], ``(n, height, width)``."""
+        return np.stack([self.views[self.frames[key].index].template for key in keys]) / 255.0
 
     @property
     def frame_rate_hz(self) -> float:
@@ -65,14 +75,22 @@ class Drive:
         return None if region is None else tuple(edge // self.factor for edge in region)
 
 
-def read_drive(source: Source, stop: int | None = None) -> Drive:
+def read_drive(
+    source: Source, stop: int | None = None, encoder: FeatureEncoder | None = None
+) -> Drive:
     """Read a source once and keep its pictures small; frames that cannot be used are left out.
+
+    Args:
+        source: Not a live one.
+        stop: Frame to stop before.
+        encoder: Makes the templates, where they are not of grey.
 
     Raises:
         SourceError: If fewer than a hundred frames have a picture.
     """
     frames: list[Frame] = []
     faults: list[BadFrame] = []
+    views: dict[int, Encoded] = {}
     factor, size = 1, (0, 0)
     for frame in source.frames(stop=stop, on_bad_frame=faults.append):
         if frame.image is None:
@@ -82,6 +100,9 @@ def read_drive(source: Source, stop: int | None = None) -> Drive:
             factor = max(1, size[0] // _WIDTH_PX)
         if (frame.image.shape[1], frame.image.shape[0]) != size:
             continue
+        if encoder is not None:
+            view = encoder(frame.image)
+            views[frame.index] = view._replace(template=to_bytes(view.template))
         frames.append(frame._replace(image=_smaller(frame.image, factor)))
         if len(frames) == MAX_FRAMES:
             break
@@ -90,7 +111,7 @@ def read_drive(source: Source, stop: int | None = None) -> Drive:
             f"{source.name}: {len(frames)} frames with a picture; tuning needs {_MIN_FRAMES} or "
             "more, of a drive that comes back to where it was"
         )
-    return Drive(frames, factor, size, len(faults))
+    return Drive(frames, factor, size, len(faults), None if encoder is None else views)
 
 
 def _smaller(image: np.ndarray, factor: int) -> np.ndarray:

@@ -99,7 +99,7 @@ def pairwise(templates: np.ndarray, shift: int = 3) -> np.ndarray:
     """Return the mean difference of each two views, the smallest over shifts sideways.
 
     Args:
-        templates: Grey in [0, 1], ``(n, height, width)``.
+        templates: In [0, 1], ``(n, height, width)``.
         shift: Columns that one may be shifted by against the other.
 
     Returns:

@@ -11,7 +11,7 @@ fallen into a heap is consistent. Revisits are found in sequences of pictures
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.tuning.revisits import Revisits
 from neuroslam.types import Frame
+from neuroslam.view.preprocess import Encoded
 
 
 class Trial(NamedTuple):
@@ -44,17 +45,33 @@ class Trial(NamedTuple):
     track_xy: np.ndarray
 
 
-def drive_through(config: BrainConfig, frames: Iterable[Frame]) -> tuple[NavigationBrain, dict]:
+def drive_through(
+    config: BrainConfig, frames: Iterable[Frame], views: Mapping[int, Encoded] | None = None
+) -> tuple[NavigationBrain, dict]:
     """Map frames with the views, pose cells and map of a config; nothing else.
+
+    Args:
+        config: Of the brain.
+        frames: With pictures.
+        views: Templates by the frames' indices, as bytes, where a network has made them; a frame
+            without one is left out.
 
     Returns:
         The brain, and the place of each frame's index.
     """
     sessions = config.sessions.model_copy(update={"carried": "ignore"})
     alone = config.model_copy(update={"cells": ("pose",), "sessions": sessions, "max_gap_s": 1e9})
-    brain, places = NavigationBrain(alone), {}
+    now = -1
+
+    def look_up(_image: np.ndarray) -> Encoded:
+        if now not in views:
+            raise BadFrame("no template was made of it")
+        return Encoded(views[now].template / 255.0, views[now].contrast)
+
+    brain, places = NavigationBrain(alone, features=None if views is None else look_up), {}
     with torch.inference_mode():
         for frame in frames:
+            now = frame.index
             try:
                 places[frame.index] = brain(frame).experience
             except BadFrame:

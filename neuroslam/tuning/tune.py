@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from neuroslam.config import BrainConfig, to_toml
 from neuroslam.errors import RunError
@@ -21,7 +22,8 @@ from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
 from neuroslam.tuning.search import Trial, best_of, drive_through, judge
-from neuroslam.tuning.views import ViewScore, best_view
+from neuroslam.tuning.views import ViewScore, best_view, score_views
+from neuroslam.view.features import FeatureEncoder
 
 FEW_REVISITS = 30
 """Revisits below which a drive tells too little about its loops to search by them."""
@@ -77,6 +79,7 @@ class Tuning:
             "notes": self.notes,
             "templates": [
                 {
+                    "features": score.config.features,
                     "crop": score.config.crop,
                     "width": score.config.template_width,
                     "height": score.config.template_height,
@@ -110,6 +113,7 @@ def tune(
     stop: int | None = None,
     overwrite: bool = False,
     on_stage: Callable[[str], None] | None = None,
+    features: nn.Module | None = None,
 ) -> Tuning:
     """Find crop, template, threshold, field of view, speed and injection for a source's pictures.
 
@@ -124,6 +128,8 @@ def tune(
         stop: Frame to stop before; at most 12 000 frames are looked at.
         overwrite: Replace an earlier tuning in ``out``.
         on_stage: Called with what is being done.
+        features: Network that makes views, where ``config.view.features`` is ``"module"``. Of a
+            network, crop and size of the template stay as they are.
 
     Raises:
         SourceError: If the source cannot be read, or has fewer than a hundred pictures.
@@ -143,7 +149,7 @@ def tune(
         raise RunError(f"{opened.name}: is live; tuning looks several times, so tune a recording")
     tell = on_stage or (lambda stage: None)
     with one_thread():
-        tuning = _tune(opened, config, stop, tell)
+        tuning = _tune(opened, config, stop, tell, features)
         figure = plot_tuning(tuning, opened.name)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -156,10 +162,15 @@ def tune(
 
 
 def _tune(
-    source: Source, config: BrainConfig, stop: int | None, tell: Callable[[str], None]
+    source: Source,
+    config: BrainConfig,
+    stop: int | None,
+    tell: Callable[[str], None],
+    features: nn.Module | None,
 ) -> Tuning:
     tell("reading")
-    drive = read_drive(source, stop)
+    encoder = None if config.view.features == "grey" else FeatureEncoder(config.view, features)
+    drive = read_drive(source, stop, encoder)
     keys = key_frames(drive)
     tell("looking for places seen twice")
     revisits = find_revisits(drive.pictures[keys])
@@ -210,6 +221,23 @@ def _set(tuning: Tuning, section: str, why: str, **values: object) -> None:
 
 
 def _choose_view(tuning: Tuning, drive: Drive, search: bool) -> None:
+    if drive.views is None:
+        _choose_template(tuning, drive, search)
+    else:
+        templates = drive.templates(tuning.keys)
+        grey = fitting(ViewConfig(), drive.frames[0].image.shape)  # for comparison
+        tuning.views = [
+            score_views(templates, tuning.config.view, tuning.revisits),
+            *best_view(drive.pictures[tuning.keys], [grey], tuning.revisits),
+        ]
+    chosen = tuning.views[0]
+    alike, unlike = np.median(chosen.neighbours), np.quantile(chosen.others, 0.05)
+    _set(tuning, "view", "between neighbours and far frames",
+         threshold=_rounded(max(0.005, math.sqrt(alike * unlike))))  # fmt: skip
+
+
+def _choose_template(tuning: Tuning, drive: Drive, search: bool) -> None:
+    """Choose what tells places best apart in pictures of grey."""
     pictures = drive.pictures[tuning.keys]
     now = tuning.config.view
     now = fitting(now.model_copy(update={"crop": drive.here(now.crop)}), pictures[0].shape)
@@ -227,10 +255,6 @@ def _choose_view(tuning: Tuning, drive: Drive, search: bool) -> None:
              template_height=now.template_height, patch_radius=now.patch_radius)  # fmt: skip
     else:
         tuning.views = best_view(pictures, [now], tuning.revisits)
-    chosen = tuning.views[0]
-    alike, unlike = np.median(chosen.neighbours), np.quantile(chosen.others, 0.05)
-    _set(tuning, "view", "between neighbours and far frames",
-         threshold=_rounded(max(0.005, math.sqrt(alike * unlike))))  # fmt: skip
 
 
 def _usable(
@@ -300,7 +324,7 @@ def _choose_threshold(tuning: Tuning, drive: Drive) -> None:
                 "pose_cells": tuning.config.pose_cells.model_copy(update={"inject_energy": energy}),
             }
         )
-        brain, places = drive_through(_on_small(config, drive), drive.frames)
+        brain, places = drive_through(_on_small(config, drive), drive.frames, drive.views)
         return judge(config, brain, places, keys, tuning.revisits)
 
     energy = tuning.config.pose_cells.inject_energy
@@ -341,7 +365,7 @@ def _compare(tuning: Tuning, source: Source, drive: Drive, before: BrainConfig) 
     maps = []
     for config in (before, tuning.config):
         frames = source.frames(stop=last, on_bad_frame=lambda fault: None)
-        brain, places = drive_through(config, frames)
+        brain, places = drive_through(config, frames, drive.views)
         maps.append(judge(config, brain, places, keys, tuning.revisits))
     tuning.before, tuning.after = maps
 

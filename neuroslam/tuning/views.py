@@ -43,17 +43,15 @@ class ViewScore(NamedTuple):
         return 1 + int(beyond[0]) if len(beyond) else len(self.growth)
 
 
-def score_views(pictures: np.ndarray, config: ViewConfig, revisits: Revisits) -> ViewScore:
+def score_views(templates: np.ndarray, config: ViewConfig, revisits: Revisits) -> ViewScore:
     """Recognise each key frame among all others and compare with what stretches say.
 
     Args:
-        pictures: Key frames, as for :func:`~neuroslam.tuning.revisits.find_revisits`.
-        config: Of the template; its threshold is not used.
+        templates: Of the key frames, in [0, 1], ``(n, template_height, template_width)``.
+        config: Of the templates; its threshold is not used.
         revisits: Which key frames show one place.
     """
-    apart = pairwise(
-        np.stack([encode(picture, config).template for picture in pictures]), config.shift_match
-    )
+    apart = pairwise(templates, config.shift_match)
     n, near = len(apart), revisits.near
     known = near.any(axis=1)
     far = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) >= revisits.gap
@@ -83,6 +81,15 @@ def score_views(pictures: np.ndarray, config: ViewConfig, revisits: Revisits) ->
 def best_view(
     pictures: np.ndarray, configs: Iterable[ViewConfig], revisits: Revisits
 ) -> list[ViewScore]:
-    """Score templates, the best first; of equals the one given first."""
-    scores = [score_views(pictures, config, revisits) for config in configs]
+    """Score templates of grey, the best first; of equals the one given first.
+
+    Args:
+        pictures: Key frames, as for :func:`~neuroslam.tuning.revisits.find_revisits`.
+        configs: Of the templates.
+        revisits: Which key frames show one place.
+    """
+    scores = [
+        score_views(np.stack([encode(p, config).template for p in pictures]), config, revisits)
+        for config in configs
+    ]
     return sorted(scores, key=lambda score: -round(score.average_precision, 3))
