@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from neuroslam import cli
+from neuroslam import cli, vision
 from neuroslam.sensors import open_source
 from neuroslam.types import ViewMatch
 
@@ -60,6 +61,11 @@ def inputs(tmp_path_factory):
     walk = 0.5 * np.column_stack([np.cos(angle), np.sin(0.7 * angle)])
     np.savez(home / "rat.npz", t=0.05 * np.arange(1500), pos=walk, arena_radius=1.0)
     _datasets(home, frames)
+    vision.load()
+    from torchvision.models import mobilenet_v2
+
+    with torch.random.fork_rng():
+        torch.save(mobilenet_v2().state_dict(), home / "mobilenet_v2.pth")
     return home
 
 
@@ -140,7 +146,7 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
         assert code == 0, f"{line}\n{told.err}{told.out}"
 
 
-@pytest.mark.parametrize("name", ["own_population.md", "sweeps.md", "tuning.md"])
+@pytest.mark.parametrize("name", ["own_population.md", "sweeps.md", "tuning.md", "features.md"])
 def test_the_programs_of_a_page_run_as_printed(name, inputs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive.avi").symlink_to(inputs / "drive.avi")

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, OTHER, STYLE, new_figure
+from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, OTHER, STYLE, new_figure, write_title
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
         config = score.config
         rows = "all rows" if config.crop is None else f"rows {config.crop[2]} to {config.crop[3]}"
         patch = f", patch {config.patch_radius}" if config.patch_radius else ""
-        of = "" if config.features == "grey" else f"{config.features}, "
+        of = "" if config.features == "grey" else f"{config.features}\n"
         label = f"{of}{config.template_width} x {config.template_height}, {rows}{patch}"
         seen.setdefault(label, score.average_precision)
     chosen = next(iter(seen))
@@ -104,10 +104,10 @@ def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
 def _draw_track(axes: Axes, trial: "Trial", title: str, unit: str) -> None:
     off = trial.inconsistency
     told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
+    write_title(axes, title, f"{trial.n_places} places{told}")
     axes.plot(*trial.track_xy.T, color=MAP, lw=0.6)
     axes.plot(*trial.track_xy[0], "o", color=OTHER, ms=5, label="start")
     axes.plot(*trial.track_xy[-1], "s", color=INK, ms=4, label="end")
-    axes.set(title=f"{title}: {trial.n_places} places{told}", xlabel=f"x ({unit})",
-             ylabel=f"y ({unit})")  # fmt: skip
+    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend()
