@@ -71,6 +71,7 @@ def collect(run: FinishedRun) -> Facts:
         "cells": list(run.brain.config.cells),
         "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
         "threshold": run.brain.config.view.threshold,
+        "features": run.brain.config.view.features,
         "actions": ACTIONS,
         "summary": _summary(run),
         "sessions": _sessions(run),

@@ -63,6 +63,7 @@ function templateFigure(template, note = "") {
     figure.append(make("div", { class: "nothing", text: "no template" }), make("figcaption", { text: note }));
     return figure;
   }
+  const madeOf = about.features === "grey" ? "" : ", features of a network";
   const canvas = make("canvas", { class: "template", width, height, role: "img", "aria-label": `Template ${template}` });
   const pen = canvas.getContext("2d"), image = pen.createImageData(width, height), first = template * width * height;
   for (let i = 0; i < width * height; i++) {
@@ -71,7 +72,7 @@ function templateFigure(template, note = "") {
   }
   pen.putImageData(image, 0, 0);
   canvas.style.aspectRatio = Math.min(4, Math.max(1.2, width / height));
-  figure.append(canvas, make("figcaption", { text: `template ${template}${note}` }));
+  figure.append(canvas, make("figcaption", { text: `template ${template}${note}${madeOf}` }));
   return figure;
 }
 
