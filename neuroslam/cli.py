@@ -94,6 +94,12 @@ Start = Annotated[int, typer.Option(help="First frame.")]
 BadFrame = Annotated[
     OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
 ]
+SaveEvery = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS", min=0.0, help="Save while driving, for `resume`; 0: only at the end."
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
 ]
@@ -130,6 +136,7 @@ def run_command(
     stop: Stop = None,
     on_bad_frame: BadFrame = OnBadFrame.stop,
     no_tensorboard: NoTensorboard = False,
+    save_every: SaveEvery = 60.0,
     overwrite: Overwrite = False,
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
@@ -155,18 +162,29 @@ def run_command(
             overwrite=overwrite,
             on_step=on_step,
             on_start=on_start,
+            save_every_s=save_every,
         )
     return _report(summary, out, "run")
 
 
 @app.command("resume")
-def resume_command(out: RunFolder, stop: Stop = None, no_tensorboard: NoTensorboard = False) -> int:
+def resume_command(
+    out: RunFolder,
+    stop: Stop = None,
+    no_tensorboard: NoTensorboard = False,
+    save_every: SaveEvery = 60.0,
+) -> int:
     """Go on where the run in DIR stopped."""
     from neuroslam.runs import resume
 
     with _progress(str(out)) as (on_start, on_step):
         summary = resume(
-            out, stop=stop, tensorboard=not no_tensorboard, on_step=on_step, on_start=on_start
+            out,
+            stop=stop,
+            tensorboard=not no_tensorboard,
+            on_step=on_step,
+            on_start=on_start,
+            save_every_s=save_every,
         )
     return _report(summary, out, "resume")
 

@@ -11,7 +11,7 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.brain.sessions import session_name
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
-from neuroslam.run_files import brain_file
+from neuroslam.run_files import brain_file, track_file
 from neuroslam.spiking.export import export_nir
 from neuroslam.storage import write_atomically
 
@@ -56,7 +56,7 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
     if to.resolve() == source.resolve():
         raise RunError(f"{to}: is the brain itself; take another file")
     if asked == "tum" and path.is_dir():
-        track = path / "trajectory.tum"
+        track = track_file(path)
         read_tum(track)  # a damaged one is no export
 
         def write() -> None:

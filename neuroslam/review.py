@@ -23,6 +23,7 @@ from neuroslam.run_files import (
     read_frames,
     read_plan,
     read_trace,
+    track_file,
     trajectory,
     true_poses,
 )
@@ -48,7 +49,7 @@ def evaluate(
     if align not in get_args(AlignmentMode):
         raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
     out = track if track.is_dir() else None
-    found = read_tum(track if out is None else out / "trajectory.tum")
+    found = read_tum(track if out is None else track_file(out))
     if truth is not None:
         true = read_tum(Path(truth))
         i, j = associate(found.times_s, true.times_s)

@@ -81,6 +81,22 @@ def brain_file(path: str | Path) -> Path:
     return path / "brain.safetensors" if path.is_dir() else path
 
 
+def track_file(out: Path) -> Path:
+    """Return the track of a run, which is written at its end.
+
+    Raises:
+        RunError: If the run was killed before.
+    """
+    track = out / "trajectory.tum"
+    if (
+        not track.exists()
+        and (out / "brain.safetensors").exists()
+        and (out / "frames.csv").exists()
+    ):
+        raise RunError(f"{out}: was cut off before its end; go on with: neuroslam resume {out}")
+    return track
+
+
 def require_free(out: Path, source: str, overwrite: bool) -> None:
     """Make sure that a new run in a folder destroys nothing that it should not.
 
@@ -108,6 +124,7 @@ class RowWriter:
         try:
             out.mkdir(parents=True, exist_ok=True)
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
+                _remove_halves(out)
                 shutil.rmtree(out / "events", ignore_errors=True)
                 for name in (*RUN_FILES[2:], LANDMARKS_FILE):  # none would fit the new rows
                     (out / name).unlink(missing_ok=True)
@@ -138,12 +155,19 @@ class RowWriter:
                     raise RunError(f"{out}/trace.f64: shorter than the run; cannot resume")
                 trace.truncate(rows * row_bytes)
                 trace.seek(0, os.SEEK_END)
+                _remove_halves(out)
                 yield cls(frames, trace)
         except OSError as error:
             raise RunError(
                 f"{error.filename or out}: cannot be used ({error.strerror or error}); "
                 "cannot resume"
             ) from None
+
+    def flush(self) -> None:
+        """Bring the rows so far to the disk: neither a kill nor a power cut loses them."""
+        for file in (self.frames, self.trace):
+            file.flush()
+            os.fsync(file.fileno())
 
     def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
         """Append the rows of one frame."""
@@ -163,6 +187,13 @@ class RowWriter:
         truth = frame.truth or (math.nan, math.nan, math.nan)
         row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion, *truth)
         self.trace.write(np.array(row, dtype="<f8").tobytes())
+
+
+def _remove_halves(out: Path) -> None:
+    """Remove what a run that was killed while it wrote a file has left of it."""
+    for name in RUN_FILES:
+        for half in out.glob(f".{name}.*.tmp"):
+            half.unlink(missing_ok=True)
 
 
 def read_trace(

@@ -53,6 +53,9 @@ from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.types import Frame, StepResult
 
+SAVE_EVERY_S = 60.0
+"""Of the clock on the wall; what a killed run may lose."""
+
 
 @dataclass
 class RunSummary:
@@ -144,6 +147,7 @@ def run(
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
     features: nn.Module | None = None,
+    save_every_s: float = SAVE_EVERY_S,
 ) -> RunSummary:
     """Map a source and write the run's files into a folder.
 
@@ -161,6 +165,8 @@ def run(
         on_step: Called after each frame, e.g. to show progress.
         on_start: Called once, with the number of the frame to stop before; ``None``: unknown.
         features: Network that makes views, where ``config.view.features`` is ``"module"``.
+        save_every_s: Seconds after which the brain is saved while it drives, so that a run which
+            is killed can be resumed from there; 0: only at the end.
 
     Returns:
         What was done; a bad frame under ``stop`` ends the run, whose files are still written,
@@ -197,7 +203,8 @@ def run(
             raise RunError(f"{source}: no usable frame{_and_why(summary.skipped)}")
         with RowWriter.create(out) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked)
+            keep = _keeper(brain, plan, out, summary, output, save_every_s)
+            _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked, keep)
         return write_results(brain, plan, out, summary)
 
 
@@ -209,6 +216,7 @@ def resume(
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
     features: nn.Module | None = None,
+    save_every_s: float = SAVE_EVERY_S,
 ) -> RunSummary:
     """Go on where a run stopped; its files end up equal to those of an uncut run.
 
@@ -219,6 +227,7 @@ def resume(
         on_step: Called after each frame.
         on_start: As for :func:`run`.
         features: The network that makes views, where one was passed to the run.
+        save_every_s: As for :func:`run`.
 
     Raises:
         RunError: If the folder holds no run, parts of it are missing, or it is past ``stop``.
@@ -238,7 +247,8 @@ def resume(
         steps = _steps(brain, opened, onward, summary)
         with RowWriter.reopen(out, seen) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            _drive(brain, steps, output, recorder, summary, on_step, asked)
+            keep = _keeper(brain, plan, out, summary, output, save_every_s)
+            _drive(brain, steps, output, recorder, summary, on_step, asked, keep)
         return write_results(brain, plan, out, summary)
 
 
@@ -273,6 +283,7 @@ def _drive(
     summary: RunSummary,
     on_step: Callable[[StepResult], None] | None,
     asked: list[int],
+    keep: Callable[[], None],
 ) -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     try:
@@ -282,6 +293,7 @@ def _drive(
                 recorder.step(result, frame, brain)
                 if on_step is not None:
                     on_step(result)
+                keep()
                 if asked:
                     break
     except (SourceError, MapError) as error:  # what was mapped so far is kept
@@ -291,6 +303,35 @@ def _drive(
     summary.skipped = list(dict.fromkeys(summary.skipped))
     summary.seconds += time.perf_counter() - wall
     summary.cpu_seconds += time.process_time() - cpu
+
+
+def _keeper(
+    brain: NavigationBrain,
+    plan: RunPlan,
+    out: Path,
+    summary: RunSummary,
+    output: RowWriter,
+    every_s: float,
+) -> Callable[[], None]:
+    """Return what saves a run that goes on still, when it is time to: a kill loses no more."""
+    saved = time.monotonic()
+
+    def keep() -> None:
+        nonlocal saved
+        if every_s and time.monotonic() - saved >= every_s:
+            output.flush()  # a brain must not have seen frames that have no row
+            so_far = replace(summary, frames=brain.clock.frames_seen, interrupted=True)
+            _save(brain, plan, out, so_far)
+            saved = time.monotonic()
+
+    return keep
+
+
+def _save(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> None:
+    """Write what a run goes on from."""
+    write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
+    write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
+    save_brain(brain, out / "brain.safetensors")
 
 
 def _and_why(skipped: list[str]) -> str:
@@ -374,9 +415,7 @@ def write_results(
             }
     try:
         # What cannot be made again comes first: one who kills the run now can still resume it.
-        write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
-        write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
-        save_brain(brain, out / "brain.safetensors")
+        _save(brain, plan, out, summary)
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
         if brain.config.has("semantic"):

@@ -128,6 +128,28 @@ def test_a_killed_run_is_drawn_and_evaluated_as_it_was_saved_and_goes_on(copy, t
         assert (copy / name).read_bytes() == (tmp_path / "uncut" / name).read_bytes(), name
 
 
+def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_files(tmp_path, says):
+    out = tmp_path / "run"
+    killed(out, ["run", WORLD, "-o", out, "--save-every", "0.05"], rows=200)
+    told = json.loads((out / "metrics.json").read_text())
+    assert told["interrupted"]
+    assert told["frames"] > 0
+    assert (out / "brain.safetensors").is_file()
+    stop = 30 + len(read_trace(out)["time_s"])
+    for command in ("plot", "inspect", "report"):  # what was saved can be looked at
+        assert says(command, out)[0] == 0
+    (out / ".brain.safetensors.abcd1234.tmp").write_bytes(b"half")  # killed while it saved
+    said = f"{out}: was cut off before its end; go on with: neuroslam resume {out}\n"
+    for command in (("evaluate", out), ("export", out, tmp_path / "a.tum")):
+        assert says(*command) == (2, "", f"neuroslam {command[0]}: {said}")
+    assert says("resume", out, "--stop", stop, QUICK, "--save-every", "0")[0] == 0
+    run(WORLD, tmp_path / "uncut", stop=stop, tensorboard=False, save_every_s=0.0)
+    for name in set(RUN_FILES) - {"metrics.json", "config.toml"}:
+        assert (out / name).read_bytes() == (tmp_path / "uncut" / name).read_bytes(), name
+    assert not json.loads((out / "metrics.json").read_text())["interrupted"]
+    assert not list(out.glob(".*"))
+
+
 def test_a_run_that_was_killed_before_it_saved_says_so(tmp_path, says):
     out = tmp_path / "run"
     killed(out, ["run", WORLD, "-o", out], rows=50)
