@@ -265,8 +265,9 @@ def test_a_session_joins_the_map_of_its_network_and_keeps_the_network(first, tou
 def test_maps_of_two_networks_are_not_merged(first, tour):
     other = lived(tour[:60], filters(seed=1))
     assert "the weights of 'module', by which views were made" in find_match(first, other).reason
-    with pytest.raises(ConfigError, match="another config: the weights of 'module'"):
-        other.store(first)
+    for brain in (other, NavigationBrain(config_of(), features=filters(seed=1))):
+        with pytest.raises(ConfigError, match="another config: the weights of 'module'"):
+            brain.store(first)
 
 
 def test_where_the_weights_lie_does_not_matter(squeezenet):

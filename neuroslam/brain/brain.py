@@ -307,8 +307,10 @@ class NavigationBrain(nn.Module):
             other: It is not altered; the maps that it has stored itself are taken too.
 
         Raises:
-            ConfigError: If views or pose cells of the two were made with different configs.
+            ConfigError: If views or pose cells of the two were made with different configs, or
+                views by another network.
         """
+        self.view.load_network()
         apart = differing(self, other)
         if apart:
             raise ConfigError(

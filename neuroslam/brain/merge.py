@@ -170,8 +170,8 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
 def differing(one: "NavigationBrain", other: "NavigationBrain") -> list[str]:
     """Name what keeps two brains from being merged: parameters, or the network of their views."""
     keys = differing_keys(one.config, other.config)
-    digests = {brain.view.network_digest for brain in (one, other) if brain.view.n}
-    if not keys and len(digests) > 1:
+    networks = {brain.view.network_digest for brain in (one, other)} - {0}
+    if not keys and len(networks) > 1:
         keys = [f"the weights of {one.config.view.features!r}, by which views were made"]
     return keys
 

@@ -92,15 +92,24 @@ class LocalViewCells(Population):
         """
         return self._encode(image).template
 
+    def load_network(self) -> None:
+        """Load the network that makes templates, where there is one; it must be the map's.
+
+        Raises:
+            ConfigError: If it cannot be loaded, or is not the one that made the templates.
+        """
+        if not isinstance(self.encoder, FeatureEncoder):
+            return
+        if not self.n:
+            self.network.digest = self.encoder.digest
+        elif self.network.digest != self.encoder.digest:
+            raise ConfigError(
+                f"view.features = {self.config.features!r}: the {self.n} views of the map were "
+                "made with other weights; give those, or begin a new map"
+            )
+
     def _encode(self, image: np.ndarray) -> Encoded:
-        if isinstance(self.encoder, FeatureEncoder):
-            if not self.n:
-                self.network.digest = self.encoder.digest
-            elif self.network.digest != self.encoder.digest:
-                raise ConfigError(
-                    f"view.features = {self.config.features!r}: the {self.n} views of the map were "
-                    "made with other weights; give those, or begin a new map"
-                )
+        self.load_network()
         return self.encoder(image)
 
     def template_image(self, template: int) -> np.ndarray:
