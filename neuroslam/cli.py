@@ -2,9 +2,12 @@
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from importlib.metadata import version
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 from typer.core import TyperGroup
 
 from neuroslam.errors import ConfigError, NeuroslamError
@@ -115,6 +118,22 @@ RayAddress = Annotated[
 ]
 
 
+def _tell_version(asked: bool) -> None:
+    if asked:
+        console.print(f"neuroslam {version('neuroslam')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_tell_version, is_eager=True, help="Tell the version."),
+    ] = False,
+) -> None:
+    """Take the options that belong to no command."""
+
+
 @app.command("run")
 def run_command(
     source: Source,
@@ -186,6 +205,8 @@ def resume_command(
             on_start=on_start,
             save_every_s=save_every,
         )
+    if not summary.added and not summary.failure and not summary.interrupted:
+        console.print("Nothing was left to do: the run had come to its end already")
     return _report(summary, out, "resume")
 
 
@@ -239,7 +260,7 @@ def tune_command(
             overwrite=overwrite,
             on_stage=on_stage,
         )
-    table = Table("parameter", "before", "found", "because")
+    table = _table("parameter", "before", "found", "because")
     for key, (before, found, why) in tuning.changes.items():
         table.add_row(key, *("none" if v is None else _shown(v) for v in (before, found)), why)
     console.print(table)
@@ -250,6 +271,7 @@ def tune_command(
             f"{name}: {trial.n_places} places, {trial.n_links} links, "
             f"inconsistency {_shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
         )
+    console.print(tuning.verdict)
     console.print(f"Written: {out}; now: neuroslam run {source} --config {out}/config.toml -o map")
     return 0
 
@@ -474,10 +496,11 @@ def presets_command() -> int:
     """List the presets and what they are for."""
     from neuroslam.config import preset_folder, preset_names
 
-    table = Table("preset", "for")
+    table = _table("preset", "for")
     for name in preset_names():
-        first = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()[0]
-        table.add_row(name, first.lstrip("# "))
+        lines = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()
+        about = takewhile(lambda line: line.startswith("#"), lines)
+        table.add_row(name, " ".join(line.lstrip("# ") for line in about))
     console.print(table)
     return 0
 
@@ -520,9 +543,14 @@ def _name_and_file(text: str) -> tuple[str, Path]:
     return name, Path(file)
 
 
+def _table(*names: str, title: str | None = None) -> Table:
+    """Make a table whose words are never cut: a name that is told is one to be copied."""
+    return Table(*(Column(name, overflow="fold") for name in names), title=title)
+
+
 def _down(rows: list[dict[str, Any]], title: str) -> Table:
     """Make a table of a line a row."""
-    table = Table(*(key.replace("_", " ") for key in rows[0]), title=title)
+    table = _table(*(key.replace("_", " ") for key in rows[0]), title=title)
     for row in rows:
         table.add_row(*map(_shown, row.values()))
     return table
@@ -650,7 +678,10 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         _print_report(report)
     _print_not_joined(summary)
     if summary.unplaced:
-        console.print(f"{summary.unplaced} frames are on maps that were not joined")
+        console.print(
+            f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
+            "where the robot only seemed to be carried: --set sessions.carried=ignore"
+        )
     if summary.accuracy:
         console.print(
             f"error against the truth (ATE, rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
@@ -667,8 +698,10 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
 
 
 def _print_not_joined(summary: "RunSummary") -> None:
-    for stored in summary.not_joined:
+    for stored in summary.not_joined[:3]:
         console.print(f"not joined: the map of {', '.join(stored['sessions'])}; {stored['reason']}")
+    if len(summary.not_joined) > 3:
+        console.print(f"not joined: {len(summary.not_joined) - 3} more maps, see metrics.json")
 
 
 def _print_report(report: dict[str, Any]) -> None:
@@ -681,6 +714,22 @@ def _print_report(report: dict[str, Any]) -> None:
         console.print(f"  {line}")
 
 
+@contextmanager
+def _quiet_writers() -> Iterator[None]:
+    """Let no thread print a disk's fault: TensorBoard's writer raises it again where it is used."""
+    before = threading.excepthook
+
+    def failed(what: threading.ExceptHookArgs) -> None:
+        if not isinstance(what.exc_value, OSError):
+            before(what)
+
+    threading.excepthook = failed
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+
+
 def _complain(command: str, text: str) -> None:
     print(f"neuroslam {command}: {text}", file=sys.stderr)
 
@@ -690,7 +739,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
     command = arguments[0] if arguments else ""
     try:
-        return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
+        with _quiet_writers():
+            return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except typer.Abort:
         _complain(command, "interrupted")
         return INTERRUPTED

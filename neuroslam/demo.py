@@ -45,6 +45,7 @@ def demo(
 
     Raises:
         RunError: If the folder holds another run, or cannot be written.
+        KeyboardInterrupt: If a session was; its run is saved.
     """
     out = Path(out)
     for folder in (out, out / "first", out / "second"):
@@ -66,6 +67,8 @@ def demo(
                 overwrite=True, on_step=on_step, on_start=on_start,
             )
         )  # fmt: skip
+        if parts[-1].interrupted:  # half a session would be told as if it were whole
+            raise KeyboardInterrupt
     draw_summary(out / "second", out / "summary.png")
     _draw_sessions(out, parts[1])
     first, second = (part.to_dict() for part in parts)

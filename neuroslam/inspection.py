@@ -30,6 +30,8 @@ from neuroslam.run_files import (
     experiences_csv,
     landmarks_csv,
     links_csv,
+    read_metrics,
+    read_plan,
     read_trace,
     trajectory,
 )
@@ -374,7 +376,12 @@ def _origin_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
 
 
 def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
-    """Say where the files of a run disagree with its brain."""
+    """Say where the files of a run disagree with its brain, or cannot be read."""
+    for read in (read_plan, read_metrics):
+        try:
+            read(out)
+        except NeuroslamError as error:
+            yield str(error)
     expected = {
         "experiences.csv": experiences_csv(brain),
         "links.csv": links_csv(brain.map.links),

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, Literal, TextIO
+from typing import Any, BinaryIO, Literal, TextIO
 
 import numpy as np
 
@@ -39,6 +39,9 @@ RUN_FILES = (
 )  # fmt: skip
 LANDMARKS_FILE = "landmarks.csv"
 """Besides, where the brain has a semantic map."""
+
+TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
+"""Figures of a run that differ from one time to the next; all others do not."""
 
 
 OnBadFrame = Literal["skip", "stop"]
@@ -361,6 +364,11 @@ def read_plan(out: str | Path) -> RunPlan:
         table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
         return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
     except OSError:
+        if (Path(out) / "brain.safetensors").exists():
+            raise RunError(
+                f"{path}: is missing, and says what the run reads; put it back. The map is in "
+                f"{Path(out) / 'brain.safetensors'}, which can be used alone"
+            ) from None
         if (Path(out) / "frames.csv").exists():
             raise RunError(
                 f"{out}: was cut off before anything was saved; run it again with --overwrite"
@@ -368,6 +376,24 @@ def read_plan(out: str | Path) -> RunPlan:
         raise RunError(f"{out}: not a run, it has no config.toml") from None
     except (KeyError, TypeError, ValueError):  # not TOML, not text, or not of a run
         raise RunError(f"{path}: has no usable [run] table; is it of a run?") from None
+
+
+def read_metrics(out: str | Path) -> dict[str, Any]:
+    """Read the figures of a run.
+
+    Raises:
+        RunError: If there are none, or they are damaged.
+    """
+    path = Path(out) / "metrics.json"
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        for name in ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges"):
+            metrics[name]
+    except FileNotFoundError:
+        raise RunError(f"{path}: missing; is {out} a run?") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path}: damaged ({error})") from None
+    return metrics
 
 
 def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:

@@ -42,6 +42,7 @@ from neuroslam.run_files import (
     landmarks_csv,
     links_csv,
     odometry_track,
+    read_metrics,
     read_plan,
     read_trace,
     require_free,
@@ -59,9 +60,10 @@ SAVE_EVERY_S = 60.0
 
 @dataclass
 class RunSummary:
-    """What a run did: the content of ``metrics.json``."""
+    """What a run did: the content of ``metrics.json``, and how many frames it took in just now."""
 
     frames: int = 0
+    added: int = 0
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
@@ -291,6 +293,7 @@ def _drive(
             for frame, result in steps:
                 output.write(result, frame, brain)
                 recorder.step(result, frame, brain)
+                summary.added += 1
                 if on_step is not None:
                     on_step(result)
                 keep()
@@ -445,12 +448,9 @@ def recorded(source: str) -> str:
 
 
 def _read_summary(out: Path) -> RunSummary:
-    try:
-        old = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-        return RunSummary(
-            seconds=float(old["seconds"]),
-            cpu_seconds=float(old["cpu_seconds"]),
-            skipped=list(old["skipped"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        raise RunError(f"{out}/metrics.json: missing or damaged; cannot resume") from None
+    old = read_metrics(out)
+    return RunSummary(
+        seconds=float(old["seconds"]),
+        cpu_seconds=float(old["cpu_seconds"]),
+        skipped=list(old["skipped"]),
+    )

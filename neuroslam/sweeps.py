@@ -22,8 +22,6 @@ from neuroslam.sensors.open import absolute_spec, seeded_spec
 from neuroslam.sweep_drawing import plot_sweep
 
 SUMMARY = "sweep.json"
-TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
-"""Figures of a run that differ from one time to the next; all others do not."""
 
 _SEEDS = {
     "place": ("grid_cells.seed",),

@@ -7,14 +7,18 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from safetensors.torch import load_file, save_file
 
+from neuroslam import cli
 from neuroslam.cli import main
+from neuroslam.config import preset_names
 from neuroslam.run_files import read_frames
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60"
@@ -350,11 +354,11 @@ def test_a_brain_that_cannot_be_loaded_is_named_and_left_as_it_is(damage, cause,
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
-        ("config.toml", None, r"earlier: was cut off before anything was saved; run it again"),
+        ("config.toml", None, r"config\.toml: is missing, and says what the run reads"),
         ("config.toml", b"[view]\n", r"config\.toml: has no usable \[run\] table"),
         ("config.toml", b"\xff\xfe", r"config\.toml: has no usable \[run\] table"),
-        ("metrics.json", None, r"metrics\.json: missing or damaged"),
-        ("metrics.json", b"[]", r"metrics\.json: missing or damaged"),
+        ("metrics.json", None, r"metrics\.json: missing; is "),
+        ("metrics.json", b"[]", r"metrics\.json: damaged"),
         ("frames.csv", None, r"frames\.csv: .*cannot resume"),
         ("frames.csv", b"frame\n0\n", r"frames\.csv: 1 rows, the brain has seen 12 frames"),
         ("trace.f64", None, r"trace\.f64: .*cannot resume"),
@@ -437,6 +441,23 @@ def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):
     ]
     presets = call("presets")
     assert (presets.code, "irat" in presets.out) == (0, True)
+
+
+def test_words_of_a_table_are_never_cut(monkeypatch, capsys):
+    told = "".join(sorted(preset_names()))
+    monkeypatch.setattr(cli, "console", Console(width=30))
+    assert cli.main(["presets"]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    names = "".join(line.split("│")[1].strip() for line in shown.splitlines() if "│" in line)
+    assert names == told
+    assert "all at once." in " ".join(
+        line.split("│")[2].strip() for line in shown.splitlines() if "│" in line
+    )
+
+
+def test_the_version_is_told(call):
+    assert call("--version").out == f"neuroslam {version('neuroslam')}\n"
 
 
 COMMANDS = (

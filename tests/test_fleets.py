@@ -11,8 +11,7 @@ from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
 from neuroslam.fleets import FleetReport, Part, _pairs, fleet
-from neuroslam.run_files import RUN_FILES
-from neuroslam.sweeps import TIMINGS
+from neuroslam.run_files import RUN_FILES, TIMINGS
 
 LOOK = "width=128&height=32"
 RING = f"world:ellipse?laps=0.4&noise=0.01&{LOOK}"

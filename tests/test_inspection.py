@@ -16,8 +16,8 @@ from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.inspection import inspect, verify
-from neuroslam.run_files import FRAME_COLUMNS, experiences_csv, links_csv
-from neuroslam.runs import run
+from neuroslam.run_files import FRAME_COLUMNS, RunPlan, experiences_csv, links_csv
+from neuroslam.runs import RunSummary, run
 from neuroslam.sensors import open_source
 
 ELLIPSE = "world:ellipse?laps=2&width=256&height=64"
@@ -364,6 +364,15 @@ FOLDER_DAMAGE = {
         "trajectory.tum: poses 59 are not where the brain has them",
     ),
     "trace": (lambda out: (out / "trace.f64").unlink(), "trace.f64: missing; is "),
+    "no plan": (lambda out: (out / "config.toml").unlink(), "config.toml: is missing, and says"),
+    "half a plan": (
+        lambda out: (out / "config.toml").write_text("cells = ["),
+        "config.toml: has no usable [run] table",
+    ),
+    "half the figures": (
+        lambda out: (out / "metrics.json").write_text('{"frames": '),
+        "metrics.json: damaged (Expecting value",
+    ),
 }
 
 
@@ -384,6 +393,8 @@ def test_a_folder_of_merged_maps_has_no_frames(joined, tmp_path):
     (tmp_path / "experiences.csv").write_text(experiences_csv(brain))
     (tmp_path / "links.csv").write_text(links_csv(brain.map.links))
     (tmp_path / "frames.csv").write_text(FRAME_COLUMNS + "\n")
+    (tmp_path / "config.toml").write_text(RunPlan("world:corridor").to_toml())
+    (tmp_path / "metrics.json").write_text(json.dumps(RunSummary().to_dict()))
     assert verify(tmp_path) == []
 
 

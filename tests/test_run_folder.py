@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from neuroslam.cli import main
+from neuroslam.recording import TensorBoardRecorder
 from neuroslam.run_files import RUN_FILES, read_frames, read_trace
 from neuroslam.runs import run
 
@@ -91,6 +92,52 @@ def test_the_demo_replaces_no_run_but_a_demo(copy, says):
     assert code == 2
     assert err == f"neuroslam demo: {copy}: holds a run of something else; take another folder\n"
     assert contents(copy) == before
+
+
+def test_a_demo_that_is_interrupted_tells_no_figures(tmp_path, says, monkeypatch):
+    out, step = tmp_path / "demo", TensorBoardRecorder.step
+
+    def press(recorder, result, *rest):
+        if result.frame == 5:
+            signal.raise_signal(signal.SIGINT)
+        step(recorder, result, *rest)
+
+    monkeypatch.setattr(TensorBoardRecorder, "step", press)
+    assert says("demo", "-o", out) == (130, "", "neuroslam demo: interrupted\n")
+    assert not list(out.glob("*.png"))
+    assert len(read_frames(out / "first")["frame"]) == 6
+
+
+def test_a_run_at_its_end_says_that_nothing_was_left_to_do(copy, says):
+    code, out, _ = says("resume", copy, "--stop", 30, QUICK)
+    assert (code, out.splitlines()[0]) == (
+        0, "Nothing was left to do: the run had come to its end already",
+    )  # fmt: skip
+    assert "Nothing" not in says("resume", copy, "--stop", 31, QUICK)[1]
+
+
+def test_a_lost_config_does_not_cost_the_map(copy, says):
+    (copy / "config.toml").unlink()
+    code, _, err = says("resume", copy)
+    assert (code, "overwrite" in err) == (2, False)
+    assert err == (
+        f"neuroslam resume: {copy}/config.toml: is missing, and says what the run reads; put it "
+        f"back. The map is in {copy}/brain.safetensors, which can be used alone\n"
+    )
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    """No file may grow beyond 40 kB: TensorBoard's thread is the first to find out."""
+    small = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000));"
+    command = f"run {WORLD} --stop 400 -o {tmp_path / 'run'}".split()
+    program = f"{small} import sys; from neuroslam.cli import main; sys.exit(main({command}))"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"neuroslam run: {tmp_path / 'run'}: cannot be written (File too large)\n"
+    )
 
 
 def test_a_run_is_not_resumed_backwards(copy, says):

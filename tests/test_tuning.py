@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -71,6 +72,20 @@ def test_a_figure_of_eight_does_not_tell_the_field_of_view():
     shift_px = np.r_[np.full(100, 2.0), np.full(100, -2.0)]
     pairs = np.array([[0, 199], [1, 199]])
     assert field_of_view(Shifts((0, 9, 0, 9), shift_px, shift_px), 160, pairs) is None
+
+
+@pytest.mark.parametrize(
+    ("before", "found", "said"),
+    [
+        (0.4, 0.05, "more consistent than before, 3 places fewer: take it"),
+        (0.019, 0.022, "about as consistent as before, 3 places fewer"),
+        (0.02, 0.2, "less consistent than before, 3 places fewer: keep what you had"),
+        (0.02, math.nan, "not known to be better: the drive does not tell"),
+    ],
+)
+def test_tuning_says_whether_it_is_worth_taking(before, found, said, tuned):
+    maps = [Trial(BrainConfig(), j, n, n, n, None) for j, n in ((before, 10), (found, 7))]
+    assert replace(tuned[0], before=maps[0], after=maps[1]).verdict == said
 
 
 class Mapped:

@@ -14,7 +14,7 @@ from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.report.reading import Curve, FinishedRun
-from neuroslam.run_files import odometry_track, places_of, trajectory, true_poses
+from neuroslam.run_files import TIMINGS, odometry_track, places_of, trajectory, true_poses
 
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000
@@ -323,8 +323,8 @@ def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
     """
     rows = []
     for key, value in metrics.items():
-        if isinstance(value, list | dict):
-            continue
+        if isinstance(value, list | dict) or (key in TIMINGS and not value):
+            continue  # a merge takes no time that was measured
         name, unit = key, ""
         if key.endswith(("_m", "_s")) and "_per_" not in key:
             name, _, unit = key.rpartition("_")

@@ -1,6 +1,5 @@
 """What a finished run left in its folder, read and checked once."""
 
-import json
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from neuroslam.run_files import (
     brain_file,
     read_actions,
     read_frames,
+    read_metrics,
     read_plan,
     read_trace,
 )
@@ -77,21 +77,9 @@ def read_run(out: str | Path) -> FinishedRun:
         frames,
         actions,
         {name: column[:rows] for name, column in trace.items()},
-        _read_metrics(out),
+        read_metrics(out),
         read_curves(out, frames["frame"]),
     )
-
-
-def _read_metrics(out: Path) -> dict[str, Any]:
-    path = out / "metrics.json"
-    try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        metrics["frames"], metrics["merge_reports"], metrics["refused_merges"]
-    except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{path}: damaged ({error})") from None
-    return metrics
 
 
 def read_curves(out: Path, frames: np.ndarray) -> dict[str, Curve]:

@@ -109,9 +109,14 @@ def judge(
 
 
 def best_of(trials: list[Trial]) -> Trial:
-    """Take the smallest map among those about as consistent as the best: 10 % worse, or 0.005."""
-    best = min(trial.inconsistency for trial in trials)
+    """Take the smallest map among those about as consistent as the best."""
+    best = level_with(min(trial.inconsistency for trial in trials))
     return min(
-        (trial for trial in trials if trial.inconsistency <= max(1.1 * best, best + 0.005)),
+        (trial for trial in trials if trial.inconsistency <= best),
         key=lambda trial: (trial.n_places, trial.inconsistency),
     )
+
+
+def level_with(inconsistency: float) -> float:
+    """Return up to where another map is about as consistent: 10 % worse, or 0.005."""
+    return max(1.1 * inconsistency, inconsistency + 0.005)

@@ -21,7 +21,7 @@ from neuroslam.tuning.drawing import plot_tuning
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
-from neuroslam.tuning.search import Trial, best_of, drive_through, judge
+from neuroslam.tuning.search import Trial, best_of, drive_through, judge, level_with
 from neuroslam.tuning.views import ViewScore, best_view, score_views
 from neuroslam.view.features import FeatureEncoder
 
@@ -67,9 +67,24 @@ class Tuning:
     before: Trial | None = None
     after: Trial | None = None
 
+    @property
+    def verdict(self) -> str:
+        """Whether the config found is worth taking, in words."""
+        old, new = self.before, self.after
+        if old is None or new is None or not new.inconsistency >= 0.0:  # NaN: not known
+            return "not known to be better: the drive does not tell"
+        fewer = old.n_places - new.n_places
+        size = f"{abs(fewer)} places {'fewer' if fewer > 0 else 'more'}" if fewer else "as large"
+        if new.inconsistency > level_with(old.inconsistency):
+            return f"less consistent than before, {size}: keep what you had"
+        if old.inconsistency <= level_with(new.inconsistency):
+            return f"about as consistent as before, {size}"
+        return f"more consistent than before, {size}: take it"
+
     def to_dict(self) -> dict[str, Any]:
         """Name every figure: the content of ``tune.json``."""
         return {
+            "verdict": self.verdict,
             "revisits": len(self.revisits.same),
             "key_frames": len(self.keys),
             "changes": [
