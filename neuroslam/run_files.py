@@ -40,6 +40,8 @@ RUN_FILES = (
 LANDMARKS_FILE = "landmarks.csv"
 """Besides, where the brain has a semantic map."""
 
+_FIGURES = ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges")
+
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
 """Figures of a run that differ from one time to the next; all others do not."""
 
@@ -387,7 +389,7 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     path = Path(out) / "metrics.json"
     try:
         metrics = json.loads(path.read_text(encoding="utf-8"))
-        for name in ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges"):
+        for name in _FIGURES:
             metrics[name]
     except FileNotFoundError:
         raise RunError(f"{path}: missing; is {out} a run?") from None
