@@ -636,8 +636,14 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         f"{figures['templates']} templates, {figures['experiences']} experiences, "
         f"{figures['links']} links, {figures['loop_closures']} loop closures"
     )
+    for note in summary.unused:
+        console.print(note)
     if not figures["experiences"]:
-        console.print("No places: there was nothing to recognise. Without a camera: --preset slrb")
+        console.print(
+            "No places: no picture has the contrast that view.min_contrast asks for"
+            if summary.pictures
+            else "No places: there were no pictures. Without a camera: --preset slrb"
+        )
     if "place_cells" in figures:
         lost = figures["lost_s"]
         console.print(

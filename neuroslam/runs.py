@@ -65,6 +65,8 @@ class RunSummary:
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
+    pictures: bool = False
     interrupted: bool = False
     counts: dict[str, float] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
@@ -90,6 +92,8 @@ class RunSummary:
             "frames_on_no_joined_map": self.unplaced,
             "skipped_frames": len(self.skipped),
             "skipped": self.skipped,
+            "unused": self.unused,
+            "pictures": self.pictures,
             "interrupted": self.interrupted,
             **self.accuracy,
         }
@@ -100,6 +104,8 @@ def resolve_config(
     config: Path | None = None,
     assignments: tuple[str, ...] = (),
     base: BrainConfig | None = None,
+    *,
+    option: str = "--set",
 ) -> BrainConfig:
     """Lay a config file over a preset, and single assignments over both.
 
@@ -109,6 +115,7 @@ def resolve_config(
         assignments: Texts like ``view.threshold=0.04``.
         base: What all is laid over where there is neither preset nor file, as a stored map's
             config; the defaults if not given.
+        option: What the user wrote the assignments with, for messages.
 
     Raises:
         ConfigError: If a preset, file, key or value cannot be used.
@@ -128,7 +135,7 @@ def resolve_config(
     for text in assignments:
         values = merge_values(values, parse_assignment(text))
     if assignments:
-        origin = "--set" if not config else f"{origin} with --set"
+        origin = option if not config else f"{origin} with {option}"
     return build_config(values, origin)
 
 
@@ -205,6 +212,7 @@ def run(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             keep = _keeper(brain, plan, out, summary, output, save_every_s)
             _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked, keep)
+        summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
 
@@ -249,6 +257,7 @@ def resume(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             keep = _keeper(brain, plan, out, summary, output, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, asked, keep)
+        summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
 
@@ -272,6 +281,7 @@ def _steps(
                 raise
             skip(error)
         else:
+            summary.pictures |= frame.image is not None
             yield frame, result
 
 
@@ -451,6 +461,7 @@ def _read_summary(out: Path) -> RunSummary:
             seconds=float(old["seconds"]),
             cpu_seconds=float(old["cpu_seconds"]),
             skipped=list(old["skipped"]),
+            pictures=bool(old.get("pictures")),
         )
     except (OSError, ValueError, KeyError, TypeError):
         raise RunError(f"{out}/metrics.json: missing or damaged; cannot resume") from None

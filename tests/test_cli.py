@@ -97,6 +97,12 @@ def sources(tmp_path_factory):
         ("nan.csv", r"nan\.csv: frame 0 \(line 2\): its motion is v = nan m/s"),
         ("short.csv", r"short\.csv: line 2 "),
         ("world:corridr", r"world 'corridr': there is none.*did you mean 'corridor'\?"),
+        ("arena:cirle2m", r"no arena is named 'cirle2m'.*did you mean 'circle2m'\?"),
+        (
+            "http://example.com/x.mp4",
+            r"http://example\.com/x\.mp4: .*: camera:http://example\.com/x",
+        ),
+        ("camera:foo", r"camera:foo: 'foo' is neither a number nor an address; expected camera:0"),
         ("world:corridor?lap=2", r"unknown option 'lap'.*did you mean 'laps'\?"),
         ("world:corridor?laps=-1", r"option laps='-1': input should be greater than 0"),
         ("world:corridor?laps", r"option 'laps' has no value"),
@@ -106,7 +112,7 @@ def sources(tmp_path_factory):
 def test_a_source_that_cannot_be_used_is_named_and_nothing_is_overwritten(
     source, cause, sources, earlier, tmp_path, mistake
 ):
-    given = source if source.startswith("world:") else sources / source
+    given = source if ":" in source else sources / source
     before = contents(earlier)
     said = mistake("run", given, "-o", earlier, "--overwrite")
     assert re.search(cause, said), said
@@ -122,6 +128,11 @@ def test_a_source_that_cannot_be_used_is_named_and_nothing_is_overwritten(
         (["--config", "nowhere.toml"], r"config nowhere\.toml: no such file"),
         (["--set", "view.treshold=0.1"], r"unknown key 'view\.treshold'; did you mean 'view\.thr"),
         (["--set", "threshold=0.1"], r"unknown key 'threshold'; did you mean 'view\.threshold'"),
+        (["--set", "views.threshold=0.1"], r"unknown key 'views'; did you mean 'view'\?"),
+        (
+            ["--set", "semantic.spaces.seed=1"],
+            r"'semantic\.spaces'; did you mean 'semantic\.space'",
+        ),
         (["--set", "view.threshold"], r"--set 'view\.threshold': expected section\.key=value"),
         (["--set", "view.threshold=high"], r"view\.threshold = 'high': .*valid number"),
         (["--set", "view.threshold=nan"], r"view\.threshold = nan: .*finite"),
@@ -261,9 +272,34 @@ def test_a_camera_that_shows_nothing_closes_no_loop(grey, tmp_path, call):
         cv2.imwrite(str(folder / f"{i}.png"), np.full((40, 64), grey, np.uint8))
         rows.append(f"{i / 10!r},1.0,{np.pi / 2!r}")
     motion(folder / "odometry.csv", rows)
-    assert call("run", folder, "-o", tmp_path / "run", QUICK).code == 0
+    done = call("run", folder, "-o", tmp_path / "run", QUICK)
+    assert done.code == 0
+    assert "No places: no picture has the contrast that view.min_contrast asks for\n" in done.out
+    again = call("resume", tmp_path / "run", QUICK)
+    assert "No places: no picture has the contrast" in again.out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["templates"], metrics["loop_closures"]) == (80, 0, 0)
+
+
+def test_motion_alone_gives_no_places_for_want_of_pictures(tmp_path, call):
+    done = call("run", motion(tmp_path / "log.csv", LINES), "-o", tmp_path / "run", QUICK)
+    assert "No places: there were no pictures. Without a camera: --preset slrb\n" in done.out
+
+
+def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
+    """Of two seconds of video motion covers the second half second."""
+    source = f"{video(tmp_path / 'drive.avi', 40)}+{tmp_path}/log.csv"
+    motion(tmp_path / "log.csv", [f"{i / 20!r},1.0,0.1" for i in range(10, 21)])
+    done = call("run", source, "-o", tmp_path / "run", QUICK, "--stop", 5)
+    early = "motion begins at 0.5 s; 10 pictures before it were not used"
+    late = "motion ends at 1 s; 19 pictures after it were not used"
+    assert done.code == 0
+    assert (early in done.out, late in done.out) == (True, False)
+    done = call("resume", tmp_path / "run", QUICK)
+    assert done.code == 0
+    assert done.out.splitlines()[0].startswith("11 frames ")
+    assert done.out.splitlines()[1:3] == [early, late]
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["unused"] == [early, late]
 
 
 def test_a_run_is_not_overwritten_unasked(earlier, mistake):
@@ -411,7 +447,8 @@ def test_a_folder_for_figures_that_cannot_be_made_is_named(finished, tmp_path, m
 
 def test_experiments_without_their_data_or_of_no_known_name_are_refused(tmp_path, mistake):
     given = ("-o", tmp_path / "out", "--data", tmp_path)
-    assert "corridor-loops" in mistake("experiment", "corridr-loops", *given)
+    said = mistake("experiment", "corridr-loops", *given)
+    assert said.endswith("; did you mean 'corridor-loops'?\n")
     assert "nowhere" in mistake(
         "experiment", "corridor-loops", "-o", tmp_path / "out", "--data", tmp_path / "nowhere"
     )
