@@ -28,8 +28,10 @@ from neuroslam.run_files import (
     LANDMARKS_FILE,
     brain_file,
     experiences_csv,
+    frame_rows,
     landmarks_csv,
     links_csv,
+    missing_rows,
     read_trace,
     trajectory,
 )
@@ -387,15 +389,18 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
             yield f"{out / name}: {fault}"
     seen = brain.clock.frames_seen
     try:
-        rows = len((out / "frames.csv").read_text(encoding="utf-8").splitlines()) - 1
-    except (OSError, ValueError) as error:
-        yield f"{out / 'frames.csv'}: cannot be read ({_why(error)})"
+        rows = len(frame_rows(out))
+    except NeuroslamError as error:
+        yield str(error)
         return
     if rows == 0 and brain.sessions.merges:
         return  # two brains were merged: no frame was seen, and there is no track
-    if rows != seen:
-        yield f"{out / 'frames.csv'}: {rows} rows, the brain has seen {seen} frames" + (
-            "; resume the run, which was cut off" if rows > seen else ""
+    if rows < seen:
+        yield missing_rows(out, rows, seen)
+    elif rows > seen:
+        yield (
+            f"{out / 'frames.csv'}: {rows} rows, the brain has seen {seen} frames; "
+            "resume the run, which was cut off"
         )
     try:
         poses = trajectory(brain, read_trace(out, seen))

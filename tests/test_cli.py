@@ -392,7 +392,7 @@ def test_a_brain_that_cannot_be_loaded_is_named_and_left_as_it_is(damage, cause,
         ("metrics.json", None, r"metrics\.json: missing or damaged"),
         ("metrics.json", b"[]", r"metrics\.json: missing or damaged"),
         ("frames.csv", None, r"frames\.csv: .*cannot resume"),
-        ("frames.csv", b"frame\n0\n", r"frames\.csv: 1 rows, the brain has seen 12 frames"),
+        ("frames.csv", b"frame\n0\n", r"frames\.csv: damaged, 0 whole rows; .* seen 12 frames"),
         ("trace.f64", None, r"trace\.f64: .*cannot resume"),
         ("trace.f64", b"12345", r"trace\.f64: shorter than the run"),
     ],
@@ -415,6 +415,35 @@ def test_what_is_not_a_run_can_be_neither_resumed_nor_drawn_nor_evaluated(tmp_pa
         for command in ("resume", "plot", "evaluate"):
             assert str(out) in mistake(command, out)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("cut", [-1, -9, -60])
+def test_a_row_that_was_cut_off_is_told_alike_by_all_who_read_it(cut, earlier, mistake):
+    rows = (earlier / "frames.csv").read_text()
+    (earlier / "frames.csv").write_text(rows[:cut])
+    told = f"{earlier}/frames.csv: damaged, 11 whole rows; the brain has seen 12 frames"
+    for command in ("report", "verify", "plot"):
+        assert mistake(command, earlier) == f"neuroslam {command}: {told}\n"
+    assert mistake("resume", earlier) == f"neuroslam resume: {told}; cannot resume\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "inside", "told"),
+    [
+        ("sweep.json", "1-a/frames.csv", "a sweep; its runs are folders in it, as {}/1-a"),
+        ("fleet.json", "merged/frames.csv", "a fleet; its map is in {}/merged"),
+        ("fleet.json", "sessions/1/frames.csv", "a fleet; its maps are in {}/sessions"),
+        ("tune.json", "config.toml", "a tuning; use it as --config {}/config.toml"),
+    ],
+)
+def test_a_folder_of_many_runs_is_told_from_a_run(file, inside, told, tmp_path, mistake):
+    out = tmp_path / "out"
+    (out / inside).parent.mkdir(parents=True)
+    (out / inside).touch()
+    (out / file).write_text("{}")
+    for command in ("inspect", "verify", "report", "resume", "plot", "evaluate"):
+        assert mistake(command, out) == f"neuroslam {command}: {out}: is {told.format(out)}\n"
+    assert f"{out}: is {told.format(out)}" in mistake("merge", out, out, "-o", tmp_path / "both")
 
 
 def test_the_source_of_a_run_that_has_gone_is_named(tmp_path, call, mistake):
