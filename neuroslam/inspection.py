@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint
 from neuroslam.brain.sessions import Session, session_name
 from neuroslam.config import BrainConfig
-from neuroslam.errors import NeuroslamError
+from neuroslam.errors import NeuroslamError, counted
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links, closes_loop
@@ -130,8 +130,9 @@ def _session(session: Session, made: Counter[int], own: Counter[int]) -> str:
             session.source or "source unknown",
             *([f"preset {session.preset}"] if session.preset else []),
             *([f"recorded {session.recorded}"] if session.recorded else []),
-            f"{session.frames} frames from frame {session.first_frame}",
-            f"{made[session.id]} experiences" + (f" ({known} of them known)" if known else ""),
+            f"{counted(session.frames, 'frame')} from frame {session.first_frame}",
+            counted(made[session.id], "experience")
+            + (f" ({known} of them known)" if known else ""),
             f"began: {session.began}",
         ]
     )
@@ -143,7 +144,7 @@ def _merge(report: dict[str, Any]) -> tuple[str, str]:
     cells = "" if report["match"]["error"] is None else f"pose cells moved by {shift}, "
     return f"merge{at}", (
         f"session {report['partial_sessions'][-1]} into {', '.join(report['loaded_sessions'])}, "
-        f"{report['match']['places']} places agree, {cells}"
+        f"{counted(report['match']['places'], 'place agrees', 'places agree')}, {cells}"
         f"map turned by {math.degrees(report['rotation_rad']):.1f} degrees"
     )
 
@@ -399,8 +400,8 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         yield missing_rows(out, rows, seen)
     elif rows > seen:
         yield (
-            f"{out / 'frames.csv'}: {rows} rows, the brain has seen {seen} frames; "
-            "resume the run, which was cut off"
+            f"{out / 'frames.csv'}: {counted(rows, 'row')}, the brain has seen "
+            f"{counted(seen, 'frame')}; resume the run, which was cut off"
         )
     try:
         poses = trajectory(brain, read_trace(out, seen))
@@ -431,7 +432,7 @@ def _table_fault(path: Path, expected: str) -> str:
     if header != names:
         return f"its columns are {header!r}, expected {names!r}"
     if len(rows) != len(should):
-        return f"{len(rows)} rows, the brain has {len(should)}"
+        return f"{counted(len(rows), 'row')}, the brain has {len(should)}"
     differ = [
         i for i, (row, line) in enumerate(zip(rows, should, strict=True))
         if row != [float(value) for value in line.split(",")]

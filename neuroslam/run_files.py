@@ -95,7 +95,8 @@ def refuse_many(out: Path) -> None:
         what = f"a sweep; its runs are folders in it{one}"
     elif (out / "fleet.json").exists():
         merged = (out / "merged").is_dir()
-        what = f"a fleet; its {f'map is in {out}/merged' if merged else f'maps: {out}/sessions'}"
+        what = f"a fleet; its {'map is in' if merged else 'maps are in'} {out}/"
+        what += "merged" if merged else "sessions"
     elif (out / "tune.json").exists():
         what = f"a tuning; use it as --config {out}/config.toml"
     else:

@@ -26,7 +26,7 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
-from neuroslam.errors import BadFrame, MapError, RunError, SourceError
+from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.parallel import one_thread
@@ -197,7 +197,9 @@ def run(
     config = config or (stored[0].config if stored else BrainConfig())
     opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
-        raise RunError(f"{source}: has {opened.n_frames} frames, none from --start {start} on")
+        raise RunError(
+            f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
+        )
     brain, summary = NavigationBrain(config, features=features), RunSummary()
     brain.about = (plan.name, preset, recorded(plan.source))
     for one in stored:
@@ -345,7 +347,11 @@ def _save(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary)
 
 
 def _and_why(skipped: list[str]) -> str:
-    return f"; {len(skipped)} were skipped, the first: {skipped[0]}" if skipped else ""
+    return (
+        f"; {counted(len(skipped), 'was', 'were')} skipped, the first: {skipped[0]}"
+        if skipped
+        else ""
+    )
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from neuroslam.cli import main
+from neuroslam.inspection import inspect
 from neuroslam.run_files import read_frames
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60"
@@ -455,6 +456,15 @@ def test_the_source_of_a_run_that_has_gone_is_named(tmp_path, call, mistake):
     assert contents(tmp_path / "run") == before
 
 
+def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
+    rows = (finished / "trajectory.tum").read_text().splitlines(keepends=True)
+    (tmp_path / "half.tum").write_text("".join(rows[:6]))
+    done = call("evaluate", finished, "--truth", tmp_path / "half.tum")
+    assert (done.code, done.err) == (0, "")
+    assert done.out.endswith("6 of 12 frames have truth; the errors are theirs\n")
+    assert "have truth" not in call("evaluate", finished).out
+
+
 def test_evaluate_asks_for_a_truth_where_there_is_none(finished, tmp_path, call, mistake):
     source = motion(tmp_path / "log.csv", LINES)
     assert call("run", source, "-o", tmp_path / "run", QUICK).code == 0
@@ -492,6 +502,15 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
     assert "error against the truth" in error
     assert written == f"Written: {out}"
+
+
+def test_one_is_told_in_the_singular(tmp_path, call):
+    done = call("run", WORLD, "-o", tmp_path / "run", "--stop", 1, QUICK)
+    assert re.match(
+        r"1 frame at \d+ frames?/s: 1 template, 1 experience, 0 links, 0 loop closures", done.out
+    )
+    [told] = [value for name, value in inspect(tmp_path / "run") if name.startswith("session")]
+    assert "1 frame from frame 0, 1 experience, began" in told
 
 
 def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):

@@ -197,9 +197,7 @@ def test_a_folder_without_pictures_or_with_none_that_decode_is_refused(tmp_path)
     (tmp_path / "notes.md").write_text("nothing")
     assert "holds no pictures" in refused(tmp_path)
     (tmp_path / "a.jpg").write_text("nothing")
-    assert "frame 0: a.jpg is corrupt or not a picture; and so are all 1 frames" in refused(
-        tmp_path
-    )
+    assert "frame 0: a.jpg is corrupt or not a picture" in refused(tmp_path)
 
 
 def test_times_and_motion_must_be_as_many_as_pictures(tmp_path):

@@ -236,8 +236,9 @@ def test_ctrl_c_ends_all_runs_and_tells_what_was_done(tmp_path):
             assert time.monotonic() < end
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=30)
+        shown, said = process.communicate(timeout=30)
     assert process.returncode == 130
+    assert shown == f"1 of 3 runs ended: {out}/sweep.csv\n"
     assert said == "neuroslam sweep: interrupted\n"
     errors = [row["error"] for row in json.loads((out / "sweep.json").read_text())["runs"]]
     assert "no such file" in errors[0]
