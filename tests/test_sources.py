@@ -197,7 +197,10 @@ def test_a_folder_without_pictures_or_with_none_that_decode_is_refused(tmp_path)
     (tmp_path / "notes.md").write_text("nothing")
     assert "holds no pictures" in refused(tmp_path)
     (tmp_path / "a.jpg").write_text("nothing")
-    assert "frame 0: a.jpg is corrupt or not a picture" in refused(tmp_path)
+    fault = "frame 0: a.jpg is corrupt or not a picture"
+    assert refused(tmp_path).endswith(fault)
+    (tmp_path / "b.jpg").write_text("nothing")
+    assert refused(tmp_path).endswith(f"{fault}; and so are all 2 frames")
 
 
 def test_times_and_motion_must_be_as_many_as_pictures(tmp_path):
