@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Column, Table
 from typer.core import TyperGroup
 
-from neuroslam.errors import ConfigError, NeuroslamError
+from neuroslam.errors import ConfigError, NeuroslamError, counted
 from neuroslam.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
@@ -301,23 +301,36 @@ def sweep_command(
     """Map sources with all values of what is varied; exit 2 if a run failed."""
     from neuroslam.sweeps import given, sweep
 
+    so_far = (0, 0)
+
+    def note(*done_and_total: int) -> None:
+        nonlocal so_far
+        so_far = done_and_total
+        on_done("runs", *so_far)
+
     with _counting("sweep") as on_done:
-        rows = sweep(
-            sources,
-            out,
-            vary=vary or (),
-            seeds=seeds,
-            preset=preset,
-            config=config,
-            assignments=assignments or (),
-            start=start,
-            stop=stop,
-            on_bad_frame=on_bad_frame.value,
-            jobs=jobs,
-            ray=ray,
-            overwrite=overwrite,
-            on_done=lambda done, total: on_done("runs", done, total),
-        )
+        try:
+            rows = sweep(
+                sources,
+                out,
+                vary=vary or (),
+                seeds=seeds,
+                preset=preset,
+                config=config,
+                assignments=assignments or (),
+                start=start,
+                stop=stop,
+                on_bad_frame=on_bad_frame.value,
+                jobs=jobs,
+                ray=ray,
+                overwrite=overwrite,
+                on_done=note,
+            )
+        except KeyboardInterrupt:
+            if so_far[0]:
+                done, total = so_far
+                console.print(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
+            raise
     figures = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
     keys = [*given(rows), *(key for key in figures if any(row.get(key) for row in rows))]
     console.print(_down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
@@ -360,8 +373,10 @@ def fleet_command(
             on_done=on_done,
         )
     for row in report.sessions:
-        figures = f"{row['frames']} frames, {row['experiences']} places" if "frames" in row else ""
-        console.print(f"session {row['session']}: {row['source']}: {figures or 'failed'}")
+        figures = "failed"
+        if "frames" in row:
+            figures = f"{counted(row['frames'], 'frame')}, {counted(row['experiences'], 'place')}"
+        console.print(f"session {row['session']}: {row['source']}: {figures}")
     for row in report.tree:
         first, second = ("+".join(map(str, row[name])) for name in ("first", "second"))
         done = "merged" if row["merged"] else "not merged"
@@ -370,7 +385,8 @@ def fleet_command(
         error = report.merged.get("ate_rmse_m")
         console.print(
             f"one map of sessions {', '.join(map(str, report.merged['sessions']))}: "
-            f"{report.merged['experiences']} places, {report.merged['links']} links"
+            f"{counted(report.merged['experiences'], 'place')}, "
+            f"{counted(report.merged['links'], 'link')}"
             + ("" if error is None else f"; error against the truth (ATE, rigid) {error:.3f} m")
         )
     for part in report.apart:
@@ -455,9 +471,12 @@ def evaluate_command(
     table = Table(title=f"{track} against the truth, {align} alignment")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
-    for name, found, unit in evaluate(track, truth, align):
+    notes: list[str] = []
+    for name, found, unit in evaluate(track, truth, align, notes.append):
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     console.print(table)
+    for note in notes:
+        console.print(note)
     return 0
 
 
@@ -660,16 +679,25 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     if len(summary.skipped) > 3:
         _complain(command, f"skipped: {len(summary.skipped) - 3} more, see metrics.json")
     console.print(
-        f"{figures['frames']} frames at {figures['frames_per_s']:.0f} frames/s: "
-        f"{figures['templates']} templates, {figures['experiences']} experiences, "
-        f"{figures['links']} links, {figures['loop_closures']} loop closures"
+        f"{counted(figures['frames'], 'frame')} at {figures['frames_per_s']:.0f} frames/s: "
+        + ", ".join(
+            counted(figures[f"{what}s".replace(" ", "_")], what)
+            for what in ("template", "experience", "link", "loop closure")
+        )
     )
+    for note in summary.unused:
+        console.print(note)
     if not figures["experiences"]:
-        console.print("No places: there was nothing to recognise. Without a camera: --preset slrb")
+        console.print(
+            "No places: no picture has the contrast that view.min_contrast asks for"
+            if summary.pictures
+            else "No places: there were no pictures. Without a camera: --preset slrb"
+        )
     if "place_cells" in figures:
         lost = figures["lost_s"]
         console.print(
-            f"{figures['place_cells']} place cells, {figures['walls']} stretches of wall; "
+            f"{counted(figures['place_cells'], 'place cell')}, "
+            f"{counted(figures['walls'], 'stretch of wall', 'stretches of wall')}; "
             + (f"lost for {lost:.0f} s: walls contradicted the map" if lost else "never lost")
         )
     for report in summary.merges:

@@ -1,7 +1,6 @@
 """Every parameter of the brain: name, unit, bounds, what it does; files and presets to set them."""
 
 import configparser
-import difflib
 import math
 import tomllib
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from neuroslam.errors import ConfigError
+from neuroslam.errors import ConfigError, did_you_mean
 from neuroslam.sections import (
     BoundaryCellConfig,
     GridCellConfig,
@@ -139,7 +138,7 @@ def read_preset(name: str) -> dict[str, Any]:
     if name not in preset_names():
         raise ConfigError(
             f"unknown preset {name!r}; there are {', '.join(preset_names())}"
-            f"{_did_you_mean(name, preset_names())}"
+            f"{did_you_mean(name, preset_names())}"
         )
     return read_config_file(preset_folder() / f"{name}.toml")
 
@@ -199,7 +198,7 @@ def _from_classic(text: str, path: Path) -> dict[str, Any]:
             else:
                 raise ConfigError(
                     f"config {path}: unknown key {key!r} in [{section}]"
-                    f"{_did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
+                    f"{did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
                 )
     for prefix, edges in regions.items():
         where, name = _CLASSIC_REGIONS[prefix]
@@ -271,9 +270,7 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         first = error.errors()[0]
         where = ".".join(part for part in first["loc"] if isinstance(part, str))
         if first["type"] == "extra_forbidden":
-            raise ConfigError(
-                f"{origin}: unknown key {where!r}{_did_you_mean(where, _all_keys())}"
-            ) from None
+            raise ConfigError(f"{origin}: unknown key {where!r}{_key_meant(where)}") from None
         said = first["msg"].removeprefix("Value error, ")
         said = said[0].lower() + said[1:]
         if first["type"] == "model_type":
@@ -288,17 +285,18 @@ def _all_keys(section: type[BaseModel] = BrainConfig, path: str = "") -> list[st
     for name, field in section.model_fields.items():
         inner = field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
-            keys += _all_keys(inner, f"{path}{name}.")
+            keys += [f"{path}{name}", *_all_keys(inner, f"{path}{name}.")]
         else:
             keys.append(f"{path}{name}")
     return keys
 
 
-def _did_you_mean(word: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1)
-    if not close:  # a key given without its section
-        close = [key for key in known if key.rpartition(".")[2] == word.rpartition(".")[2]][:1]
-    return f"; did you mean {close[0]!r}?" if close else ""
+def _key_meant(word: str) -> str:
+    known, last = _all_keys(), word.rpartition(".")[2]
+    without_section = [key for key in known if key.rpartition(".")[2] == last]
+    return did_you_mean(word, known) or "".join(
+        f"; did you mean {key!r}?" for key in without_section[:1]
+    )
 
 
 def to_toml(config: BrainConfig) -> str:

@@ -1,5 +1,31 @@
 """Errors that a user can mend: who, what was got, what was expected, what to do, in one line."""
 
+import difflib
+from collections.abc import Iterable
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """End a line about an unknown name with the known one that is most like it, if any is.
+
+    Example:
+        >>> did_you_mean("treshold", ["threshold", "crop"]), did_you_mean("x", ["threshold"])
+        ("; did you mean 'threshold'?", '')
+    """
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def counted(n: int, one: str, several: str = "") -> str:
+    """Say how many, in the right number.
+
+    Example:
+        >>> counted(1, "frame"), counted(2, "frame"), counted(0, "loop closure")
+        ('1 frame', '2 frames', '0 loop closures')
+        >>> counted(1, "place is", "places are")
+        '1 place is'
+    """
+    return f"{n} {one if n == 1 else several or one + 's'}"
+
 
 class NeuroslamError(Exception):
     """Base of all errors that neuroslam raises on purpose; the command line prints one line."""

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint
 from neuroslam.brain.sessions import Session, session_name
 from neuroslam.config import BrainConfig
-from neuroslam.errors import NeuroslamError
+from neuroslam.errors import NeuroslamError, counted
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links, closes_loop
@@ -28,8 +28,10 @@ from neuroslam.run_files import (
     LANDMARKS_FILE,
     brain_file,
     experiences_csv,
+    frame_rows,
     landmarks_csv,
     links_csv,
+    missing_rows,
     read_metrics,
     read_plan,
     read_trace,
@@ -130,8 +132,9 @@ def _session(session: Session, made: Counter[int], own: Counter[int]) -> str:
             session.source or "source unknown",
             *([f"preset {session.preset}"] if session.preset else []),
             *([f"recorded {session.recorded}"] if session.recorded else []),
-            f"{session.frames} frames from frame {session.first_frame}",
-            f"{made[session.id]} experiences" + (f" ({known} of them known)" if known else ""),
+            f"{counted(session.frames, 'frame')} from frame {session.first_frame}",
+            counted(made[session.id], "experience")
+            + (f" ({known} of them known)" if known else ""),
             f"began: {session.began}",
         ]
     )
@@ -143,7 +146,7 @@ def _merge(report: dict[str, Any]) -> tuple[str, str]:
     cells = "" if report["match"]["error"] is None else f"pose cells moved by {shift}, "
     return f"merge{at}", (
         f"session {report['partial_sessions'][-1]} into {', '.join(report['loaded_sessions'])}, "
-        f"{report['match']['places']} places agree, {cells}"
+        f"{counted(report['match']['places'], 'place agrees', 'places agree')}, {cells}"
         f"map turned by {math.degrees(report['rotation_rad']):.1f} degrees"
     )
 
@@ -394,15 +397,18 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
             yield f"{out / name}: {fault}"
     seen = brain.clock.frames_seen
     try:
-        rows = len((out / "frames.csv").read_text(encoding="utf-8").splitlines()) - 1
-    except (OSError, ValueError) as error:
-        yield f"{out / 'frames.csv'}: cannot be read ({_why(error)})"
+        rows = len(frame_rows(out))
+    except NeuroslamError as error:
+        yield str(error)
         return
     if rows == 0 and brain.sessions.merges:
         return  # two brains were merged: no frame was seen, and there is no track
-    if rows != seen:
-        yield f"{out / 'frames.csv'}: {rows} rows, the brain has seen {seen} frames" + (
-            "; resume the run, which was cut off" if rows > seen else ""
+    if rows < seen:
+        yield missing_rows(out, rows, seen)
+    elif rows > seen:
+        yield (
+            f"{out / 'frames.csv'}: {counted(rows, 'row')}, the brain has seen "
+            f"{counted(seen, 'frame')}; resume the run, which was cut off"
         )
     try:
         poses = trajectory(brain, read_trace(out, seen))
@@ -433,7 +439,7 @@ def _table_fault(path: Path, expected: str) -> str:
     if header != names:
         return f"its columns are {header!r}, expected {names!r}"
     if len(rows) != len(should):
-        return f"{len(rows)} rows, the brain has {len(should)}"
+        return f"{counted(len(rows), 'row')}, the brain has {len(should)}"
     differ = [
         i for i, (row, line) in enumerate(zip(rows, should, strict=True))
         if row != [float(value) for value in line.split(",")]

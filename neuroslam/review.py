@@ -1,13 +1,14 @@
 """Looking back at a run: its errors against the truth, and its figures."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, counted
 from neuroslam.evaluation.trajectory import (
     AlignmentMode,
     ErrorStatistics,
@@ -30,7 +31,10 @@ from neuroslam.run_files import (
 
 
 def evaluate(
-    track: str | Path, truth: str | Path | None = None, align: AlignmentMode = "rigid"
+    track: str | Path,
+    truth: str | Path | None = None,
+    align: AlignmentMode = "rigid",
+    on_note: Callable[[str], None] | None = None,
 ) -> list[tuple[str, ErrorStatistics, str]]:
     """Compare a run, or any TUM file, with the true track.
 
@@ -38,6 +42,7 @@ def evaluate(
         track: Folder of a run, or a TUM file.
         truth: TUM file; a run of a source that knows its truth needs none.
         align: How the track is laid over the truth before it is compared.
+        on_note: Called with what the errors leave out, if they do: frames without a true pose.
 
     Returns:
         Name of the error, its statistics, its unit.
@@ -64,6 +69,11 @@ def evaluate(
     if len(estimate) < 2:
         raise RunError(
             f"{track}: {len(estimate)} of its frames have a true pose of their time; expected two"
+        )
+    n_frames = len(found.times_s)
+    if on_note is not None and len(estimate) < n_frames:
+        on_note(
+            f"{len(estimate)} of {counted(n_frames, 'frame')} have truth; the errors are theirs"
         )
     relative = relative_pose_error(estimate, reference)
     return [
@@ -113,7 +123,7 @@ def draw_map(
         truth_xy=None if truth is None else truth[on_map, :2],
         current=brain.map.pose,
         landmarks=brain.landmarks_m,
-        title=f"{name}: {len(trace['time_s'])} frames",
+        title=f"{name}: {counted(len(trace['time_s']), 'frame')}",
     )
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # a name in a script that the font lacks

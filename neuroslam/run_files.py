@@ -8,7 +8,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TextIO
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, counted
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.mapping.tables import Links, origin_key
 from neuroslam.storage import write_atomically
@@ -83,7 +83,30 @@ class RunPlan:
 def brain_file(path: str | Path) -> Path:
     """Return the brain file of a run folder, or the path itself if it is none."""
     path = Path(path)
+    refuse_many(path)
     return path / "brain.safetensors" if path.is_dir() else path
+
+
+def refuse_many(out: Path) -> None:
+    """Say what a folder is that a command for runs made no run in.
+
+    Raises:
+        RunError: If it is that of a sweep, a fleet or a tuning.
+    """
+    if (out / "brain.safetensors").exists() or (out / "frames.csv").exists():
+        return
+    if (out / "sweep.json").exists():
+        one = next((f", as {path.parent}" for path in sorted(out.glob("*/frames.csv"))), "")
+        what = f"a sweep; its runs are folders in it{one}"
+    elif (out / "fleet.json").exists():
+        merged = (out / "merged").is_dir()
+        what = f"a fleet; its {'map is in' if merged else 'maps are in'} {out}/"
+        what += "merged" if merged else "sessions"
+    elif (out / "tune.json").exists():
+        what = f"a tuning; use it as --config {out}/config.toml"
+    else:
+        return
+    raise RunError(f"{out}: is {what}")
 
 
 def track_file(out: Path) -> Path:
@@ -92,6 +115,7 @@ def track_file(out: Path) -> Path:
     Raises:
         RunError: If the run was killed before.
     """
+    refuse_many(out)
     track = out / "trajectory.tum"
     if (
         not track.exists()
@@ -148,12 +172,10 @@ class RowWriter:
                 (out / "frames.csv").open("r+") as frames,
                 (out / "trace.f64").open("r+b") as trace,
             ):
-                for done in range(rows + 1):
-                    if not frames.readline().endswith("\n"):
-                        raise RunError(
-                            f"{out}/frames.csv: {max(done - 1, 0)} rows, the brain has seen {rows} "
-                            "frames; cannot resume"
-                        )
+                frames.readline()
+                for done in range(rows):
+                    if not _is_whole(frames.readline()):
+                        raise RunError(f"{missing_rows(out, done, rows)}; cannot resume")
                 frames.seek(frames.tell())
                 frames.truncate()
                 if trace.seek(0, os.SEEK_END) < rows * row_bytes:
@@ -312,25 +334,64 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
+def frame_rows(out: str | Path, rows: int | None = None) -> list[str]:
+    """Read the whole rows of ``frames.csv``, those before the first that was cut off, as text.
+
+    Args:
+        out: Folder of the run.
+        rows: No more than so many.
+
+    Raises:
+        RunError: If there is none, or it is not text.
+    """
+    path = Path(out) / "frames.csv"
+    try:
+        with path.open(encoding="utf-8") as file:
+            return list(takewhile(_is_whole, islice(file, 1, None if rows is None else rows + 1)))
+    except FileNotFoundError:
+        raise RunError(f"{path}: missing; is {out} a run?") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: damaged ({error})") from None
+
+
+def _is_whole(line: str) -> bool:
+    return line.endswith("\n") and line.count(",") == FRAME_COLUMNS.count(",")
+
+
+def missing_rows(out: str | Path, there: int, seen: int) -> str:
+    """Say that ``frames.csv`` has fewer whole rows than the brain has seen frames."""
+    return (
+        f"{Path(out) / 'frames.csv'}: damaged, {counted(there, 'whole row')}; "
+        f"the brain has seen {counted(seen, 'frame')}"
+    )
+
+
+def _all_rows(out: str | Path, rows: int | None) -> list[str]:
+    lines = frame_rows(out, rows)
+    if rows is not None and len(lines) < rows:
+        raise RunError(missing_rows(out, len(lines), rows))
+    return lines
+
+
 def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
     """Read the columns of ``frames.csv`` that hold numbers, each as an array.
 
     Args:
         out: Folder of the run.
-        rows: As for :func:`read_trace`.
+        rows: So many, as for :func:`read_trace`; ``None``: all that are whole.
 
     Raises:
         RunError: If there is none, or it is damaged.
     """
-    path = Path(out) / "frames.csv"
     names = FRAME_COLUMNS.split(",")
     numbers = [i for i, name in enumerate(names) if name != "action"]
+    lines = _all_rows(out, rows)
+    if not lines:
+        return {names[i]: np.zeros(0) for i in numbers}
     try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=numbers, ndmin=2, max_rows=rows)
-    except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
-    except (ValueError, IndexError) as error:
-        raise RunError(f"{path}: damaged ({error})") from None
+        table = np.loadtxt(lines, delimiter=",", usecols=numbers, ndmin=2)
+    except ValueError as error:
+        raise RunError(f"{Path(out) / 'frames.csv'}: damaged ({error})") from None
     return {names[i]: table[:, column] for column, i in enumerate(numbers)}
 
 
@@ -339,20 +400,13 @@ def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:
 
     Args:
         out: Folder of the run.
-        rows: As for :func:`read_trace`.
+        rows: As for :func:`read_frames`.
 
     Raises:
         RunError: As :func:`read_frames`.
     """
-    path, column = Path(out) / "frames.csv", FRAME_COLUMNS.split(",").index("action")
-    try:
-        with path.open(encoding="utf-8") as file:
-            lines = islice(file, 1, None if rows is None else rows + 1)
-            return np.array([line.split(",")[column] for line in lines], dtype=np.str_)
-    except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
-    except (ValueError, IndexError) as error:
-        raise RunError(f"{path}: damaged ({error})") from None
+    column = FRAME_COLUMNS.split(",").index("action")
+    return np.array([line.split(",")[column] for line in _all_rows(out, rows)], dtype=np.str_)
 
 
 def read_plan(out: str | Path) -> RunPlan:
@@ -361,6 +415,7 @@ def read_plan(out: str | Path) -> RunPlan:
     Raises:
         RunError: If the folder holds no run.
     """
+    refuse_many(Path(out))
     path = Path(out) / "config.toml"
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]

@@ -26,7 +26,7 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
-from neuroslam.errors import BadFrame, MapError, RunError, SourceError
+from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.parallel import one_thread
@@ -67,6 +67,8 @@ class RunSummary:
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
+    pictures: bool = False
     interrupted: bool = False
     counts: dict[str, float] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
@@ -92,6 +94,8 @@ class RunSummary:
             "frames_on_no_joined_map": self.unplaced,
             "skipped_frames": len(self.skipped),
             "skipped": self.skipped,
+            "unused": self.unused,
+            "pictures": self.pictures,
             "interrupted": self.interrupted,
             **self.accuracy,
         }
@@ -102,6 +106,8 @@ def resolve_config(
     config: Path | None = None,
     assignments: tuple[str, ...] = (),
     base: BrainConfig | None = None,
+    *,
+    option: str = "--set",
 ) -> BrainConfig:
     """Lay a config file over a preset, and single assignments over both.
 
@@ -111,6 +117,7 @@ def resolve_config(
         assignments: Texts like ``view.threshold=0.04``.
         base: What all is laid over where there is neither preset nor file, as a stored map's
             config; the defaults if not given.
+        option: What the user wrote the assignments with, for messages.
 
     Raises:
         ConfigError: If a preset, file, key or value cannot be used.
@@ -130,7 +137,7 @@ def resolve_config(
     for text in assignments:
         values = merge_values(values, parse_assignment(text))
     if assignments:
-        origin = "--set" if not config else f"{origin} with --set"
+        origin = option if not config else f"{origin} with {option}"
     return build_config(values, origin)
 
 
@@ -192,7 +199,9 @@ def run(
     config = config or (stored[0].config if stored else BrainConfig())
     opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
-        raise RunError(f"{source}: has {opened.n_frames} frames, none from --start {start} on")
+        raise RunError(
+            f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
+        )
     brain, summary = NavigationBrain(config, features=features), RunSummary()
     brain.about = (plan.name, preset, recorded(plan.source))
     for one in stored:
@@ -207,6 +216,7 @@ def run(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             keep = _keeper(brain, plan, out, summary, output, save_every_s)
             _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked, keep)
+        summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
 
@@ -251,6 +261,7 @@ def resume(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             keep = _keeper(brain, plan, out, summary, output, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, asked, keep)
+        summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
 
@@ -274,6 +285,7 @@ def _steps(
                 raise
             skip(error)
         else:
+            summary.pictures |= frame.image is not None
             yield frame, result
 
 
@@ -338,7 +350,11 @@ def _save(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary)
 
 
 def _and_why(skipped: list[str]) -> str:
-    return f"; {len(skipped)} were skipped, the first: {skipped[0]}" if skipped else ""
+    return (
+        f"; {counted(len(skipped), 'was', 'were')} skipped, the first: {skipped[0]}"
+        if skipped
+        else ""
+    )
 
 
 @contextlib.contextmanager
@@ -453,4 +469,5 @@ def _read_summary(out: Path) -> RunSummary:
         seconds=float(old["seconds"]),
         cpu_seconds=float(old["cpu_seconds"]),
         skipped=list(old["skipped"]),
+        pictures=bool(old.get("pictures")),
     )

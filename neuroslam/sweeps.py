@@ -145,7 +145,13 @@ def _trial(
     given, *values, seed = way
     source = absolute_spec(str(given))
     texts = [*assignments, *(f"{key}={_written(v)}" for key, v in zip(keys, values, strict=True))]
-    settings = resolve_config(preset, config, tuple(texts))
+    try:
+        settings = resolve_config(
+            preset, config, tuple(texts), option="--vary" if keys else "--set"
+        )
+    except ConfigError:
+        resolve_config(preset, config, tuple(assignments))  # a mistake in these is told as theirs
+        raise
     if seed is not None:
         over = [key for cells in settings.cells for key in _SEEDS.get(cells, ()) if key not in keys]
         settings = resolve_config(None, None, tuple(f"{key}={seed}" for key in over), settings)

@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from neuroslam import cli
 from neuroslam.cli import main
 from neuroslam.config import preset_names
+from neuroslam.inspection import inspect
 from neuroslam.run_files import read_frames
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60"
@@ -101,6 +102,12 @@ def sources(tmp_path_factory):
         ("nan.csv", r"nan\.csv: frame 0 \(line 2\): its motion is v = nan m/s"),
         ("short.csv", r"short\.csv: line 2 "),
         ("world:corridr", r"world 'corridr': there is none.*did you mean 'corridor'\?"),
+        ("arena:cirle2m", r"no arena is named 'cirle2m'.*did you mean 'circle2m'\?"),
+        (
+            "http://example.com/x.mp4",
+            r"http://example\.com/x\.mp4: .*: camera:http://example\.com/x",
+        ),
+        ("camera:foo", r"camera:foo: 'foo' is neither a number nor an address; expected camera:0"),
         ("world:corridor?lap=2", r"unknown option 'lap'.*did you mean 'laps'\?"),
         ("world:corridor?laps=-1", r"option laps='-1': input should be greater than 0"),
         ("world:corridor?laps", r"option 'laps' has no value"),
@@ -110,7 +117,7 @@ def sources(tmp_path_factory):
 def test_a_source_that_cannot_be_used_is_named_and_nothing_is_overwritten(
     source, cause, sources, earlier, tmp_path, mistake
 ):
-    given = source if source.startswith("world:") else sources / source
+    given = source if ":" in source else sources / source
     before = contents(earlier)
     said = mistake("run", given, "-o", earlier, "--overwrite")
     assert re.search(cause, said), said
@@ -126,6 +133,11 @@ def test_a_source_that_cannot_be_used_is_named_and_nothing_is_overwritten(
         (["--config", "nowhere.toml"], r"config nowhere\.toml: no such file"),
         (["--set", "view.treshold=0.1"], r"unknown key 'view\.treshold'; did you mean 'view\.thr"),
         (["--set", "threshold=0.1"], r"unknown key 'threshold'; did you mean 'view\.threshold'"),
+        (["--set", "views.threshold=0.1"], r"unknown key 'views'; did you mean 'view'\?"),
+        (
+            ["--set", "semantic.spaces.seed=1"],
+            r"'semantic\.spaces'; did you mean 'semantic\.space'",
+        ),
         (["--set", "view.threshold"], r"--set 'view\.threshold': expected section\.key=value"),
         (["--set", "view.threshold=high"], r"view\.threshold = 'high': .*valid number"),
         (["--set", "view.threshold=nan"], r"view\.threshold = nan: .*finite"),
@@ -265,9 +277,34 @@ def test_a_camera_that_shows_nothing_closes_no_loop(grey, tmp_path, call):
         cv2.imwrite(str(folder / f"{i}.png"), np.full((40, 64), grey, np.uint8))
         rows.append(f"{i / 10!r},1.0,{np.pi / 2!r}")
     motion(folder / "odometry.csv", rows)
-    assert call("run", folder, "-o", tmp_path / "run", QUICK).code == 0
+    done = call("run", folder, "-o", tmp_path / "run", QUICK)
+    assert done.code == 0
+    assert "No places: no picture has the contrast that view.min_contrast asks for\n" in done.out
+    again = call("resume", tmp_path / "run", QUICK)
+    assert "No places: no picture has the contrast" in again.out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["templates"], metrics["loop_closures"]) == (80, 0, 0)
+
+
+def test_motion_alone_gives_no_places_for_want_of_pictures(tmp_path, call):
+    done = call("run", motion(tmp_path / "log.csv", LINES), "-o", tmp_path / "run", QUICK)
+    assert "No places: there were no pictures. Without a camera: --preset slrb\n" in done.out
+
+
+def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
+    """Of two seconds of video motion covers the second half second."""
+    source = f"{video(tmp_path / 'drive.avi', 40)}+{tmp_path}/log.csv"
+    motion(tmp_path / "log.csv", [f"{i / 20!r},1.0,0.1" for i in range(10, 21)])
+    done = call("run", source, "-o", tmp_path / "run", QUICK, "--stop", 5)
+    early = "motion begins at 0.5 s; 10 pictures before it were not used"
+    late = "motion ends at 1 s; 19 pictures after it were not used"
+    assert done.code == 0
+    assert (early in done.out, late in done.out) == (True, False)
+    done = call("resume", tmp_path / "run", QUICK)
+    assert done.code == 0
+    assert done.out.splitlines()[0].startswith("11 frames ")
+    assert done.out.splitlines()[1:3] == [early, late]
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["unused"] == [early, late]
 
 
 def test_a_run_is_not_overwritten_unasked(earlier, mistake):
@@ -360,7 +397,7 @@ def test_a_brain_that_cannot_be_loaded_is_named_and_left_as_it_is(damage, cause,
         ("metrics.json", None, r"metrics\.json: missing; is "),
         ("metrics.json", b"[]", r"metrics\.json: damaged"),
         ("frames.csv", None, r"frames\.csv: .*cannot resume"),
-        ("frames.csv", b"frame\n0\n", r"frames\.csv: 1 rows, the brain has seen 12 frames"),
+        ("frames.csv", b"frame\n0\n", r"frames\.csv: damaged, 0 whole rows; .* seen 12 frames"),
         ("trace.f64", None, r"trace\.f64: .*cannot resume"),
         ("trace.f64", b"12345", r"trace\.f64: shorter than the run"),
     ],
@@ -385,6 +422,35 @@ def test_what_is_not_a_run_can_be_neither_resumed_nor_drawn_nor_evaluated(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.parametrize("cut", [-1, -9, -60])
+def test_a_row_that_was_cut_off_is_told_alike_by_all_who_read_it(cut, earlier, mistake):
+    rows = (earlier / "frames.csv").read_text()
+    (earlier / "frames.csv").write_text(rows[:cut])
+    told = f"{earlier}/frames.csv: damaged, 11 whole rows; the brain has seen 12 frames"
+    for command in ("report", "verify", "plot"):
+        assert mistake(command, earlier) == f"neuroslam {command}: {told}\n"
+    assert mistake("resume", earlier) == f"neuroslam resume: {told}; cannot resume\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "inside", "told"),
+    [
+        ("sweep.json", "1-a/frames.csv", "a sweep; its runs are folders in it, as {}/1-a"),
+        ("fleet.json", "merged/frames.csv", "a fleet; its map is in {}/merged"),
+        ("fleet.json", "sessions/1/frames.csv", "a fleet; its maps are in {}/sessions"),
+        ("tune.json", "config.toml", "a tuning; use it as --config {}/config.toml"),
+    ],
+)
+def test_a_folder_of_many_runs_is_told_from_a_run(file, inside, told, tmp_path, mistake):
+    out = tmp_path / "out"
+    (out / inside).parent.mkdir(parents=True)
+    (out / inside).touch()
+    (out / file).write_text("{}")
+    for command in ("inspect", "verify", "report", "resume", "plot", "evaluate"):
+        assert mistake(command, out) == f"neuroslam {command}: {out}: is {told.format(out)}\n"
+    assert f"{out}: is {told.format(out)}" in mistake("merge", out, out, "-o", tmp_path / "both")
+
+
 def test_the_source_of_a_run_that_has_gone_is_named(tmp_path, call, mistake):
     source = motion(tmp_path / "log.csv", LINES)
     assert call("run", source, "-o", tmp_path / "run", "--stop", 4, QUICK).code == 0
@@ -392,6 +458,15 @@ def test_the_source_of_a_run_that_has_gone_is_named(tmp_path, call, mistake):
     before = contents(tmp_path / "run")
     assert f"{source}: no such file" in mistake("resume", tmp_path / "run")
     assert contents(tmp_path / "run") == before
+
+
+def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
+    rows = (finished / "trajectory.tum").read_text().splitlines(keepends=True)
+    (tmp_path / "half.tum").write_text("".join(rows[:6]))
+    done = call("evaluate", finished, "--truth", tmp_path / "half.tum")
+    assert (done.code, done.err) == (0, "")
+    assert done.out.endswith("6 of 12 frames have truth; the errors are theirs\n")
+    assert "have truth" not in call("evaluate", finished).out
 
 
 def test_evaluate_asks_for_a_truth_where_there_is_none(finished, tmp_path, call, mistake):
@@ -415,7 +490,8 @@ def test_a_folder_for_figures_that_cannot_be_made_is_named(finished, tmp_path, m
 
 def test_experiments_without_their_data_or_of_no_known_name_are_refused(tmp_path, mistake):
     given = ("-o", tmp_path / "out", "--data", tmp_path)
-    assert "corridor-loops" in mistake("experiment", "corridr-loops", *given)
+    said = mistake("experiment", "corridr-loops", *given)
+    assert said.endswith("; did you mean 'corridor-loops'?\n")
     assert "nowhere" in mistake(
         "experiment", "corridor-loops", "-o", tmp_path / "out", "--data", tmp_path / "nowhere"
     )
@@ -430,6 +506,15 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
     assert "error against the truth" in error
     assert written == f"Written: {out}"
+
+
+def test_one_is_told_in_the_singular(tmp_path, call):
+    done = call("run", WORLD, "-o", tmp_path / "run", "--stop", 1, QUICK)
+    assert re.match(
+        r"1 frame at \d+ frames?/s: 1 template, 1 experience, 0 links, 0 loop closures", done.out
+    )
+    [told] = [value for name, value in inspect(tmp_path / "run") if name.startswith("session")]
+    assert "1 frame from frame 0, 1 experience, began" in told
 
 
 def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):

@@ -341,7 +341,11 @@ FOLDER_DAMAGE = {
     "no file": (lambda out: (out / "links.csv").unlink(), "links.csv: cannot be read (No such"),
     "frames": (
         edit("frames.csv", lambda lines: lines.pop()),
-        "frames.csv: 59 rows, the brain has seen 60 frames",
+        "frames.csv: damaged, 59 whole rows; the brain has seen 60 frames",
+    ),
+    "half a frame": (
+        edit("frames.csv", lambda lines: lines.__setitem__(60, lines[60][:40])),
+        "frames.csv: damaged, 59 whole rows; the brain has seen 60 frames",
     ),
     "cut off": (
         edit("frames.csv", lambda lines: lines.append(lines[-1])),
@@ -349,7 +353,7 @@ FOLDER_DAMAGE = {
     ),
     "no frames": (
         edit("frames.csv", lambda lines: lines.__delitem__(slice(1, None))),
-        "frames.csv: 0 rows, the brain has seen 60 frames",
+        "frames.csv: damaged, 0 whole rows; the brain has seen 60 frames",
     ),
     "track": (
         edit("trajectory.tum", lambda lines: lines.append("x y\n")),

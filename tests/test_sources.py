@@ -17,6 +17,7 @@ from neuroslam.errors import BadFrame, SourceError
 from neuroslam.geometry import integrate_velocities
 from neuroslam.sensors import open_source
 from neuroslam.sensors.images import decode_grey, natural_key, parse_image_list
+from neuroslam.sensors.open import absolute_spec
 from neuroslam.sensors.tracks import motion_along
 from neuroslam.types import Frame, Pose, Velocity
 
@@ -196,9 +197,10 @@ def test_a_folder_without_pictures_or_with_none_that_decode_is_refused(tmp_path)
     (tmp_path / "notes.md").write_text("nothing")
     assert "holds no pictures" in refused(tmp_path)
     (tmp_path / "a.jpg").write_text("nothing")
-    assert "frame 0: a.jpg is corrupt or not a picture; and so are all 1 frames" in refused(
-        tmp_path
-    )
+    fault = "frame 0: a.jpg is corrupt or not a picture"
+    assert refused(tmp_path).endswith(fault)
+    (tmp_path / "b.jpg").write_text("nothing")
+    assert refused(tmp_path).endswith(f"{fault}; and so are all 2 frames")
 
 
 def test_times_and_motion_must_be_as_many_as_pictures(tmp_path):
@@ -465,6 +467,21 @@ def test_pickles_are_refused_and_not_loaded(tmp_path, monkeypatch):
 
 
 # Opening
+
+
+@pytest.mark.parametrize("name", ["trash.npz", "trash.npy"])
+def test_what_numpy_did_not_write_is_not_called_a_pickle(name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(b"xx")
+    assert refused(path) == (f"{path}: is not an .npz or .npy file; expected one that numpy wrote")
+
+
+def test_an_address_is_told_as_typed_and_stays_what_it_is():
+    address = "http://example.com/x.mp4"
+    assert refused(address).startswith(
+        f"{address}: is an address; open it as a camera: camera:http"
+    )
+    assert absolute_spec(address) == address
 
 
 def test_what_is_missing_or_of_no_known_kind_is_refused(tmp_path):

@@ -236,6 +236,25 @@ def test_a_video_whose_end_is_unknown_is_refused_when_it_has_been_read(tmp_path)
     assert "m.csv runs from 5 to 8 s" in said
 
 
+def test_pictures_before_and_after_the_motion_are_counted():
+    merged = Streams(camera_at(np.arange(10.0)), motion_at([1.0, 2.0, 3.5]))
+    assert merged.unused == ()
+    for _ in range(2):
+        assert [f.time_s for f in merged] == [1.0, 2.0, 3.0, 3.5]
+        assert merged.unused == (
+            "motion begins at 1 s; 1 picture before it was not used",
+            "motion ends at 3.5 s; 6 pictures after it were not used",
+        )
+    inside = Streams(camera_at([1.0, 2.0]), motion_at(np.arange(5.0)))
+    list(inside)
+    assert inside.unused == ()
+    unknown = camera_at(np.arange(10.0))
+    merged = Streams(unknown, motion_at([0.0, 2.0]))
+    unknown.frames, unknown.n_frames = lambda **_: iter(unknown.listed), None
+    list(merged)
+    assert merged.unused == ("motion ends at 2 s; the pictures after it were not used",)
+
+
 def test_two_of_a_kind_are_refused():
     times = np.arange(3.0)
     assert "neither has pictures; expected a camera and motion" in refused(

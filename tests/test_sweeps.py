@@ -104,7 +104,15 @@ def test_values_are_laid_over_the_preset_and_single_assignments():
         (["a.avi"], {"vary": ["view.threshold=0.1,0.1"]}, ConfigError, "has a value twice"),
         (["a.avi"], {"vary": ["map.loops=1", "map.loops=2"]}, ConfigError, "given twice"),
         (["a.avi"], {"vary": ["view.treshold=1,2"]}, ConfigError, "did you mean 'view.threshold'"),
-        (["a.avi"], {"vary": ["map.loops=5,many"]}, ConfigError, "map.loops = 'many'"),
+        (["a.avi"], {"vary": ["view.treshold=1,2"]}, ConfigError, "--vary: unknown key"),
+        (["a.avi"], {"vary": ["map.loops=5,many"]}, ConfigError, "--vary: map.loops = 'many'"),
+        (
+            ["a.avi"],
+            {"vary": ["map.loops=5,6"], "assignments": ["view.treshold=1"]},
+            ConfigError,
+            "--set: unknown key 'view.treshold'",
+        ),
+        (["a.avi", "b.avi"], {"assignments": ["view.treshold=1"]}, ConfigError, "--set: unknown"),
         (["a.avi"], {"seeds": 2}, RunError, "nothing is random in a.avi with cells pose"),
         (["a.avi"], {"seeds": 0}, RunError, "seeds is 0; expected 1 or more"),
         ([f"{WORLD}&seed=1"], {"seeds": 2}, SourceError, "has a seed already"),
@@ -228,8 +236,9 @@ def test_ctrl_c_ends_all_runs_and_tells_what_was_done(tmp_path):
             assert time.monotonic() < end
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=30)
+        shown, said = process.communicate(timeout=30)
     assert process.returncode == 130
+    assert shown == f"1 of 3 runs ended: {out}/sweep.csv\n"
     assert said == "neuroslam sweep: interrupted\n"
     errors = [row["error"] for row in json.loads((out / "sweep.json").read_text())["runs"]]
     assert "no such file" in errors[0]

@@ -19,7 +19,7 @@ from neuroslam.cells.boundary import check_walls
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
-from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.errors import BadFrame, ConfigError, counted
 from neuroslam.geometry import TWO_PI, compose, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
@@ -481,8 +481,8 @@ class NavigationBrain(nn.Module):
                 "reason": "maps without views are laid on each other when they are finished: "
                 "neuroslam merge"
                 if not self.config.has("pose")
-                else f"{alike} places looked like one of it, {agreed} at most agreed on how "
-                f"the maps lie; {needed} must",
+                else f"{counted(alike, 'place')} looked like one of it, {agreed} at most agreed on "
+                f"how the maps lie; {needed} must",
             }
             for one, alike, agreed in zip(
                 self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True

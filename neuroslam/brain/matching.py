@@ -9,6 +9,7 @@ from neuroslam.brain.limits import elsewhere, far_off, tolerance
 from neuroslam.brain.merge import Match, differing
 from neuroslam.brain.sessions import session_name
 from neuroslam.brain.wall_matching import match_walls
+from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
 from neuroslam.mapping.tables import Origins, origin_key
@@ -71,8 +72,8 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     if sizes[0] < confirm:
         return Found(
             None,
-            f"{len(np.unique(pairs.partial))} places look alike, but at most {sizes[0]} of them "
-            f"agree on how the maps lie, and {confirm} must (--confirm)",
+            f"{counted(len(np.unique(pairs.partial)), 'place looks', 'places look')} alike, but at "
+            f"most {sizes[0]} of them agree on how the maps lie, and {confirm} must (--confirm)",
             sizes,
         )
     confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
@@ -88,7 +89,9 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
         runner_up=_runner_up(loaded, partial, first, at, limits),
         others=_once(others),
     )
-    return Found(match, f"{len(match.pairs.partial)} places are the same", sizes)
+    return Found(
+        match, f"{counted(len(match.pairs.partial), 'place is', 'places are')} the same", sizes
+    )
 
 
 def _alike(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Pairs, float | None]:
@@ -166,7 +169,9 @@ def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Fou
         int(pairs.loaded[at]), int(pairs.partial[at]), float(pairs.turn_rad[at]), others=pairs
     )
     return Found(
-        match, f"{len(pairs.partial)} places are of sessions that both maps hold", (len(i),)
+        match,
+        f"{counted(len(pairs.partial), 'place is', 'places are')} of sessions that both maps hold",
+        (len(i),),
     )
 
 

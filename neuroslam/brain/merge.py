@@ -12,7 +12,7 @@ from neuroslam.brain.limits import far_off, tolerance
 from neuroslam.cells.attractor import moved_cells
 from neuroslam.cells.joining import view_frames
 from neuroslam.config import BrainConfig
-from neuroslam.errors import MapError
+from neuroslam.errors import MapError, counted
 from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.joining import links_kept
 from neuroslam.mapping.overlap import Pairs
@@ -111,7 +111,7 @@ class MergeReport:
             lines.append(
                 f"match: place {m['partial_experience']} (frame {m['partial_frame']}) is place "
                 f"{m['loaded_experience']} (frame {m['loaded_frame']}), "
-                f"{m['places']} places agree"
+                f"{counted(m['places'], 'place agrees', 'places agree')}"
             )
         if self.found:
             lines.append(f"found: {self.found}")
@@ -401,7 +401,11 @@ def merge(
     report.merged = True
     places = report.counts["experiences"]
     new = places["merged"] - places["loaded"]
-    report.reason = f"{new} places are new" if new else "nothing is new: the place was known"
+    report.reason = (
+        f"{counted(new, 'place is', 'places are')} new"
+        if new
+        else "nothing is new: the place was known"
+    )
     merged.sessions.merges.append(report.to_dict())
     return merged, report
 

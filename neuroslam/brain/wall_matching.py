@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuroslam.brain.merge import Match
+from neuroslam.errors import counted
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.types import Pose
@@ -199,7 +200,7 @@ def match_walls(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[
     match = _places(loaded, partial, laid)
     if match is None:
         return None, f"{said}, but no place of one is near a place of the other"
-    return match, f"{said}; {len(match.pairs.partial)} places are the same"
+    return match, f"{said}; {counted(len(match.pairs.partial), 'place is', 'places are')} the same"
 
 
 def outline_of(brain: "NavigationBrain") -> Outline:

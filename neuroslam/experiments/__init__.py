@@ -6,7 +6,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, did_you_mean
 
 _SESSIONS = "neuroslam.experiments.multisession"
 
@@ -65,7 +65,10 @@ def run_experiment(
             independent lives or views that ``jobs``, ``ray`` or ``networks`` could be used for.
     """
     if name not in EXPERIMENTS:
-        raise RunError(f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}")
+        raise RunError(
+            f"no experiment {name!r}; there are {', '.join(EXPERIMENTS)}"
+            f"{did_you_mean(name, EXPERIMENTS)}"
+        )
     module, function, folder = EXPERIMENTS[name]
     recordings = None
     if folder is None and data is not None and name in _IF_THERE:

@@ -9,9 +9,9 @@ import numpy as np
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import NeuroslamError, RunError
 from neuroslam.run_files import (
-    FRAME_COLUMNS,
     RunPlan,
     brain_file,
+    frame_rows,
     read_actions,
     read_frames,
     read_metrics,
@@ -58,17 +58,9 @@ def read_run(out: str | Path) -> FinishedRun:
         raise RunError(f"{out}: {what}; expected the folder of a run")
     plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
     rows = brain.clock.frames_seen
-    actions = read_actions(out, rows)
-    if not len(actions) and brain.sessions.merges:
+    if brain.sessions.merges and not frame_rows(out, 1):
         rows = 0  # two brain files were merged: nobody knows their frames
-    if len(actions) < rows:
-        raise RunError(
-            f"{out}/frames.csv: damaged, {len(actions)} rows; the brain has seen {rows} frames"
-        )
-    if rows:
-        frames = read_frames(out, rows)
-    else:
-        frames = {name: np.zeros(0) for name in FRAME_COLUMNS.split(",") if name != "action"}
+    frames, actions = read_frames(out, rows), read_actions(out, rows)
     trace = read_trace(out, rows or None, min_rows=0)
     return FinishedRun(
         out,

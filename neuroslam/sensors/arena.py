@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.outlines import (
     TOUCH_M,
@@ -570,11 +570,13 @@ def named_arena(name: str) -> Arena:
         >>> named_arena("hexagon")
         Traceback (most recent call last):
         neuroslam.errors.SourceError: no arena is named 'hexagon'; expected one of circle1m,
-        circle2m, nonagon, pentagon, pillar, rectangle, square, triangle, two_rooms
+        circle2m, nonagon, pentagon, pillar, rectangle, square, triangle, two_rooms; did you mean
+        'pentagon'?
     """
     if name not in _NAMED:
         raise SourceError(
             f"no arena is named {name!r}; expected one of {', '.join(sorted(_NAMED))}"
+            f"{did_you_mean(name, _NAMED)}"
         )
     return _NAMED[name](name)
 

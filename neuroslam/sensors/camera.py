@@ -1,7 +1,9 @@
 """A live camera: ``camera:0``, or the address of a stream, ``camera:rtsp://...``."""
 
+import re
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 
@@ -24,7 +26,7 @@ class CameraSource(Source):
         device: Number of a camera of this machine, or address of a stream.
 
     Raises:
-        SourceError: If there is no such camera.
+        SourceError: If there is no such camera, or ``device`` is neither.
     """
 
     def __init__(self, device: str) -> None:
@@ -34,6 +36,11 @@ class CameraSource(Source):
         self.live = True
         if device == "":
             raise SourceError("camera: has no number; expected camera:0, or an address")
+        if not (device.isdecimal() or re.search(r"[/!]", device) or Path(device).exists()):
+            raise SourceError(
+                f"{self.name}: {device!r} is neither a number nor an address; expected camera:0 "
+                "or, as an address, camera:rtsp://HOST/PATH"
+            )
         capture = self._capture()
         rate = capture.get(cv2.CAP_PROP_FPS)
         self.frame_rate_hz = rate if 0.0 < rate < 1e4 else None

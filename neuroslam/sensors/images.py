@@ -22,7 +22,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.tracks import Clock, Track, parse_motion
 from neuroslam.types import Frame, Pose
@@ -118,12 +118,14 @@ class ImageSource(IndexedSource):
                 return self._decoded(index).shape
             except BadFrame as fault:
                 first_fault = first_fault or fault
-        raise SourceError(f"{first_fault}; and so are all {self.n_frames} frames") from None
+        others = f"; and so are all {self.n_frames} frames" if self.n_frames > 1 else ""
+        raise SourceError(f"{first_fault}{others}") from None
 
     def _require_as_many(self, n: int, what: str) -> None:
         if n != self.n_frames:
             raise SourceError(
-                f"{self.name}: {n} {what} for {self.n_frames} pictures; expected one each"
+                f"{self.name}: {n} {what} for {counted(self.n_frames, 'picture')}; "
+                "expected one each"
             )
 
 

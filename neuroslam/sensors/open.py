@@ -87,6 +87,8 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
             return open_bag(path, topics)
         path = Path(spec)
         if not path.exists():
+            if "://" in str(spec):
+                raise SourceError(f"{spec}: is an address; open it as a camera: camera:{spec}")
             raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
         return _opener(path)(path, rate)
     except OSError as error:
@@ -115,7 +117,7 @@ def absolute_spec(spec: str) -> str:
         name, mark, query = spec.removeprefix("arena:").partition("?")
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
         return f"arena:{name}{mark}{query}"
-    if spec.startswith(_MADE):
+    if spec.startswith(_MADE) or ("://" in spec and not Path(spec).exists()):
         return spec
     path, topics = _bag_topics(spec)
     if topics and is_bag(path):

@@ -1,11 +1,10 @@
 """The options behind the ``?`` of a source that is made on the fly."""
 
-import difflib
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, did_you_mean
 
 Options = TypeVar("Options", bound=BaseModel)
 
@@ -35,10 +34,9 @@ def parse_options(who: str, query: str, model: type[Options]) -> Options:
     for item in filter(None, query.split("&")):
         key, equals, value = item.partition("=")
         if key not in model.model_fields:
-            near = difflib.get_close_matches(key, model.model_fields, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
             raise SourceError(
-                f"{who}: unknown option {key!r}; there are {', '.join(model.model_fields)}{hint}"
+                f"{who}: unknown option {key!r}; there are {', '.join(model.model_fields)}"
+                f"{did_you_mean(key, model.model_fields)}"
             )
         if not equals or key in values:
             problem = "is given twice" if key in values else "has no value"

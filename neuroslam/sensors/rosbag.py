@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.sensors.images import decode_grey, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
@@ -67,7 +67,10 @@ def open_bag(path: Path, topics: dict[str, str] | None = None) -> Source:
     """
     topics = topics or {}
     if unknown := set(topics) - set(KINDS):
-        raise SourceError(f"{path}: unknown option {min(unknown)!r}; there are {', '.join(KINDS)}")
+        raise SourceError(
+            f"{path}: unknown option {min(unknown)!r}; there are {', '.join(KINDS)}"
+            f"{did_you_mean(min(unknown), KINDS)}"
+        )
     with _opened(path) as reader:
         there = {c.topic: c.msgtype for c in reader.connections}
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}

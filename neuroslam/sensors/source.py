@@ -19,12 +19,14 @@ class Source(ABC):
         n_frames: How many frames it has, or ``None`` if only reading it to the end would tell.
         frame_rate_hz: Frames per second, or ``None`` if unknown.
         live: Whether it shows what is there now, so that its frames cannot be read a second time.
+        unused: What of it is in no frame, and why, a line each; known as far as it was read last.
     """
 
     name: str
     n_frames: int | None
     frame_rate_hz: float | None
     live: bool = False
+    unused: tuple[str, ...] = ()
 
     @abstractmethod
     def frames(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.source import IndexedSource, OnBadFrame, Source
 from neuroslam.types import Frame
 
@@ -21,7 +21,8 @@ class Streams(Source):
     two rates are. Pictures come at the times of the camera. Ranges, walls, heading, landmarks and
     truth are those of the motion source's nearest sample, or else of the camera's, if one is
     within half of its period. Frames are delivered from the first to the last time that both
-    have; no more than three samples of each are held.
+    have, and ``unused`` says how many pictures are not among them; no more than three samples of
+    each are held.
 
     Args:
         camera: The source with pictures; its motion is not used. If it has none and ``motion``
@@ -92,14 +93,17 @@ class Streams(Source):
             raise SourceError(f"{self.name}: {empty.name} has no frame that can be used")
         begin_s = max(camera.next.time_s, motion.next.time_s)
         starts = camera.next.time_s, motion.next.time_s
+        passed = 0
         for cursor in (camera, motion):
             while cursor.next is not None and cursor.next.time_s < begin_s - SAME_TIME_S:
                 cursor.advance()
+                passed += cursor is camera
         if camera.next is None or motion.next is None:
             for cursor in (camera, motion):
                 while cursor.next is not None:
                     cursor.advance()
             raise self._apart((starts[0], camera.last.time_s), (starts[1], motion.last.time_s))
+        self.unused = _left_out("begins", begin_s, passed, "before") if passed else ()
         while camera.next is not None and motion.next is not None:
             time_s = min(camera.next.time_s, motion.next.time_s)
             moved = motion.next.time_s <= time_s + SAME_TIME_S
@@ -122,6 +126,9 @@ class Streams(Source):
                 motion.advance()
             if seen:
                 camera.advance()
+        if camera.next is not None:
+            n = None if camera.n_frames is None else camera.n_frames - camera.next.index
+            self.unused += _left_out("ends", motion.last.time_s, n, "after")
 
     def _apart(self, *spans: tuple[float, float]) -> SourceError:
         said = (
@@ -135,7 +142,7 @@ class _Cursor:
     """A source read one frame ahead: the ``last`` frame passed, and the ``next``."""
 
     def __init__(self, source: Source, report: Callable[[BadFrame], None]) -> None:
-        self.name = source.name
+        self.name, self.n_frames = source.name, source.n_frames
         self.half_period_s = 0.5 / source.frame_rate_hz if source.frame_rate_hz else math.inf
         self.report = report
         self.frames = source.frames(on_bad_frame=report)
@@ -166,6 +173,15 @@ class _Cursor:
         ]
         gap_s, _, frame = min(gaps, key=lambda gap: gap[:2])
         return frame if gap_s <= self.half_period_s + SAME_TIME_S else None
+
+
+def _left_out(what: str, time_s: float, n: int | None, where: str) -> tuple[str]:
+    pictures = (
+        f"the pictures {where} it were"
+        if n is None
+        else (counted(n, f"picture {where} it was", f"pictures {where} it were"))
+    )
+    return (f"motion {what} at {round(time_s, 2):.12g} s; {pictures} not used",)
 
 
 def _first_frame(source: Source) -> Frame:

@@ -26,6 +26,7 @@ _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
 _TRUTH = ("x_m", "y_m", "theta_rad")
 _FASTEST = 1e6  # m/s, rad/s: no robot's, but that of a damaged log, whose sums would overflow
+_MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # a pickle, an .npz and an .npy begin so
 _EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), if you like time_s, and x_m,y_m,theta_rad"
 
 
@@ -299,9 +300,13 @@ def _load_arrays(path: Path) -> dict[str, np.ndarray]:
                 return {"pos": loaded}
             return {key: loaded[key] for key in loaded.files}
     except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
-        if "pickle" in str(error):
+        if "pickle" in str(error):  # numpy says so of whatever it does not know
+            with path.open("rb") as file:
+                pickled = file.read(6).startswith(_MAY_HOLD_PICKLES)
             raise SourceError(
                 f"{path}: holds pickled objects, which are never loaded; expected plain arrays"
+                if pickled
+                else f"{path}: is not an .npz or .npy file; expected one that numpy wrote"
             ) from None
         raise SourceError(
             f"{path}: is not a whole .npz or .npy file ({_first_line(error)})"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.images import quiet_opencv, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.types import Frame
@@ -78,7 +78,7 @@ class VideoSource(Source):
         if missing and (stop is None or index < stop):
             fault = BadFrame(
                 f"{self.name}: frame {index} is missing: it ends there, its container announces "
-                f"{self.n_frames} frames; is it truncated?"
+                f"{counted(self.n_frames, 'frame')}; is it truncated?"
             )
             if on_bad_frame is None:
                 raise fault

@@ -1,6 +1,5 @@
 """The rendered worlds there are: geometry, looks and routes of each."""
 
-import difflib
 import math
 from collections.abc import Callable
 from functools import lru_cache
@@ -8,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors import paint, paint_outdoors
 from neuroslam.sensors.scene import (
@@ -343,7 +342,8 @@ def build_world(name: str, look: int = 0) -> World:
         SourceError: If there is no such world.
     """
     if name not in _BUILDERS:
-        near = difflib.get_close_matches(name, _BUILDERS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise SourceError(f"world {name!r}: there is none; there are {', '.join(_BUILDERS)}{hint}")
+        raise SourceError(
+            f"world {name!r}: there is none; there are {', '.join(_BUILDERS)}"
+            f"{did_you_mean(name, _BUILDERS)}"
+        )
     return _BUILDERS[name](look)

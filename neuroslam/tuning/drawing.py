@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, OTHER, STYLE, new_figure, write_title
+from neuroslam.errors import counted
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
 def _draw_track(axes: Axes, trial: "Trial", title: str, unit: str) -> None:
     off = trial.inconsistency
     told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
-    write_title(axes, title, f"{trial.n_places} places{told}")
+    write_title(axes, title, f"{counted(trial.n_places, 'place')}{told}")
     axes.plot(*trial.track_xy.T, color=MAP, lw=0.6)
     axes.plot(*trial.track_xy[0], "o", color=OTHER, ms=5, label="start")
     axes.plot(*trial.track_xy[-1], "s", color=INK, ms=4, label="end")

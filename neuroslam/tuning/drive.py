@@ -6,7 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sections import Region
 from neuroslam.sensors import Source
 from neuroslam.types import Frame
@@ -108,8 +108,8 @@ def read_drive(
             break
     if len(frames) < _MIN_FRAMES:
         raise SourceError(
-            f"{source.name}: {len(frames)} frames with a picture; tuning needs {_MIN_FRAMES} or "
-            "more, of a drive that comes back to where it was"
+            f"{source.name}: {counted(len(frames), 'frame')} with a picture; tuning needs "
+            f"{_MIN_FRAMES} or more, of a drive that comes back to where it was"
         )
     return Drive(frames, factor, size, len(faults), None if encoder is None else views)
 
