@@ -331,8 +331,7 @@ def write_decimals(axis: Axis) -> None:
 
     Example:
         >>> axes = new_figure(3.0, 3.0, None).subplots()
-        >>> axes.set(yscale="log", ylim=(0.01, 10.0))
-        [...]
+        >>> _ = axes.set(yscale="log", ylim=(0.01, 10.0))
         >>> write_decimals(axes.yaxis)
         >>> [axes.yaxis.get_major_formatter()(tick) for tick in (0.01, 0.1, 1.0, 10.0)]
         ['0.01', '0.1', '1', '10']
