@@ -148,16 +148,16 @@ def plot_place_cells(
         axes.plot(
             [], [], "o-", color=MAP, ms=4, lw=0.8, label=counted(len(centres_m), "place cell")
         )
-        walls = {"ls": "none", "marker": "s", "ms": 3.5, "color": LOOP, "zorder": 4}
-        said = counted(len(walls_m), "stretch of wall").replace(
-            "stretch of walls", "stretches of wall"
-        )
-        axes.plot(*walls_m.T, label=said, **walls)
+        if len(walls_m):
+            style = {"ls": "none", "marker": "s", "ms": 3.5, "color": LOOP, "zorder": 4}
+            axes.plot(
+                *walls_m.T, label=f"remembered wall, in {counted(len(walls_m), 'part')}", **style
+            )
         draw_robot(axes, here, "the animal now")
         axes.set(xlabel="x (m)", ylabel="y (m)")
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.05)
-        write_title(axes, "Place cells, and walls as remembered")
+        write_title(axes, "Place cells, and walls as remembered" if len(walls_m) else "Place cells")
         legend_below(axes, columns=2)
     return figure
 

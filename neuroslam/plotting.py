@@ -94,7 +94,8 @@ def plot_map(
         ValueError: If the truth has another length than the track.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(11.0 if odometry_xy is not None else 6.2, 5.6, title)
+        tall = 5.6 + 0.19 * len(session_names)  # a line of the legend each
+        figure = new_figure(11.0 if odometry_xy is not None else 6.2, tall, title)
         axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
             draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of)
