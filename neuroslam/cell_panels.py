@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from neuroslam.drawing import ACTIVITY, INK, LOOP, MAP, ODOMETRY, ROBOT, STYLE, new_figure
+from neuroslam.drawing import ACTIVITY, STYLE, new_figure
 from neuroslam.evaluation.gridness import autocorrelogram, gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
+from neuroslam.place_drawing import plot_place_cells
 
 if TYPE_CHECKING:
     from neuroslam.brain import NavigationBrain
@@ -64,7 +64,9 @@ class CellPanels:
 
     def draw(self, brain: "NavigationBrain") -> tuple[dict[str, Figure], dict[str, float]]:
         """Draw all panels; returns them, and the grid scores of the modules, by tag."""
-        figures = {"cells/place_map": self._draw_places(brain)}
+        path = np.array(self._positions).reshape(-1, 2)
+        cells = brain.navigation
+        figures = {"cells/place_map": plot_place_cells(*cells.remembered(), cells.pose, path)}
         scores: dict[str, float] = {}
         if len(self._positions) >= _LEAST_SAMPLES:
             at = np.array(self._positions)
@@ -116,31 +118,4 @@ class CellPanels:
             )
             figure.colorbar(dots, ax=axes, label="rate of the most active cell")
             axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-        return figure
-
-    def _draw_places(self, brain: "NavigationBrain") -> Figure:
-        cells = brain.navigation
-        centres, links = (part.numpy(force=True) for part in cells.place.graph())
-        wall = cells.walls.remembered()[0]
-        x, y, bearing, distance = (column.numpy(force=True) for column in wall[:4])
-        here = cells.pose
-        with mpl.rc_context(STYLE):
-            figure = new_figure(6.0, 5.8, "Place cells, and walls as remembered")
-            axes = figure.subplots()
-            if len(self._positions):
-                axes.plot(*np.array(self._positions).T, color=ODOMETRY, lw=0.3, alpha=0.5)
-            axes.add_collection(LineCollection(centres[links], colors=MAP, lw=0.7, alpha=0.7))
-            axes.plot(*centres.T, ".", color=MAP, ms=4, label=f"{len(centres)} place cells")
-            axes.plot(
-                x + distance * np.cos(bearing),
-                y + distance * np.sin(bearing),
-                "s",
-                color=LOOP,
-                ms=3.5,
-                label=f"{len(x)} stretches of wall",
-            )
-            axes.plot(here.x_m, here.y_m, "o", mfc=ROBOT, mec=INK, ms=8, label="the animal")
-            axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-            axes.margins(0.05)
-            figure.legend(loc="outside lower center", ncols=3)
         return figure

@@ -485,7 +485,7 @@ def plot_command(
     out: RunFolder,
     to: Annotated[Path | None, typer.Option(help="Folder for the figures; DIR itself.")] = None,
 ) -> int:
-    """Draw the map, the pose cells and counts over time."""
+    """Draw the map, the cells that the brain has, and counts over time."""
     from neuroslam.review import plot
 
     for path in plot(out, to or out):

@@ -8,7 +8,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from neuroslam.drawing import CURVES, INK, MAP, ODOMETRY, ROBOT, STYLE, legend_below, new_figure
+from neuroslam.drawing import (
+    CURVES,
+    INK,
+    MAP,
+    ODOMETRY,
+    ROBOT,
+    STYLE,
+    legend_below,
+    new_figure,
+    write_decimals,
+)
 
 _LEAST_M = 0.01
 
@@ -99,6 +109,7 @@ def plot_losses(
             ax.set_yscale("log")
             ax.set_ylabel("error (m)")
             ax.set_title(loss)
+        write_decimals(axes[-1].yaxis)
         axes[-1].set_xlabel("time (s)")
         legend_below(axes[-1], len(next(iter(curves.values()))))
     return figure

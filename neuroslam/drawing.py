@@ -1,8 +1,9 @@
 """What figures are made of: colours, axes with a map, cells, a view or curves on them.
 
 One visual language: grey is odometry, blue the map, vermilion a loop closure, black dashes the
-truth; a circle is the start, a square the end, an arrow the robot now. The colours are those of
-M. Okabe and K. Ito's palette, which colour-blind readers can tell apart.
+truth; a circle is the start, a square the end, an arrow the robot now; where a map is of several
+sessions each has a colour. The colours are those of M. Okabe and K. Ito's palette, which
+colour-blind readers can tell apart.
 """
 
 import math
@@ -11,15 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.font_manager import fontManager
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path as Outline
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import ScaledTranslation
 
-from neuroslam.errors import MapError
+from neuroslam.errors import MapError, counted
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align, path_length
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.types import Pose, PoseEstimate
@@ -27,11 +30,21 @@ from neuroslam.types import Pose, PoseEstimate
 ODOMETRY, MAP, LOOP, TRUTH = "#8c8c8c", "#0072B2", "#D55E00", "#000000"
 LANDMARK = "#F0E442"
 ROBOT, OTHER, INK, WALL = "#E69F00", "#009E73", "#222222", "#c9c9c9"
+SESSIONS = (MAP, ROBOT, OTHER, "#CC79A7", "#56B4E9", "#882255")
+"""A colour for each session of a map."""
 CURVES = (MAP, LOOP, OTHER, "#CC79A7", "#E69F00", "#56B4E9")
 ACTIVITY = "viridis"
 
+# DejaVu lacks the scripts of East Asia: names in them are drawn with the first of these there is.
+_EAST_ASIAN = (
+    "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans JP", "Noto Sans SC", "Source Han Sans",
+    "Hiragino Sans", "PingFang SC", "Yu Gothic", "Microsoft YaHei", "Malgun Gothic",
+    "WenQuanYi Zen Hei", "Droid Sans Fallback", "IPAGothic", "Arial Unicode MS",
+)  # fmt: skip
+_THERE = set(fontManager.get_font_names())
+
 STYLE = {
-    "font.family": "DejaVu Sans",
+    "font.family": ["DejaVu Sans", *(name for name in _EAST_ASIAN if name in _THERE)],
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -54,26 +67,18 @@ STYLE = {
 _DART = Outline([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)])
 
 
-class _Placed(NamedTuple):
-    # The map, where the truth says it lies.
-    poses: np.ndarray
-    truth: np.ndarray | None
-    current: Pose | None
+class _Truth(NamedTuple):
+    # The truth, where it lies over the map.
+    xy: np.ndarray | None
+    walls: np.ndarray
     label: str
-    landmarks: np.ndarray
 
 
-def _place(
-    poses: np.ndarray,
-    track: np.ndarray | None,
-    truth: np.ndarray | None,
-    current: Pose | None,
-    landmarks: np.ndarray,
-) -> _Placed:
+def _lay(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray | None) -> _Truth:
+    segments = np.empty((0, 2, 2)) if walls is None else np.asarray(walls).reshape(-1, 2, 2)
     if truth is None or not len(truth):
-        return _Placed(poses, None, current, "", landmarks)
-    track = poses[:, :2] if track is None else np.asarray(track)
-    truth = np.asarray(truth)
+        return _Truth(None, segments, "")
+    track, truth = np.asarray(track), np.asarray(truth)
     if len(track) != len(truth):
         raise ValueError(
             f"plot_map: truth_xy has {len(truth)} points and the track {len(track)}; "
@@ -83,20 +88,15 @@ def _place(
         motion, mode = align(track, truth, "similarity"), "similarity"
     except MapError:  # a robot that stood still: nothing to align, but there is still an error
         motion, mode = align(track, truth, "none"), "none"
-    turn = math.atan2(motion.rotation[1, 0], motion.rotation[0, 0])
     ate = absolute_trajectory_error(track, truth, mode).rmse
-    how = f"map scaled by {motion.scale:.3g}" if mode == "similarity" else "not aligned"
-    moved = np.column_stack([motion.apply(poses[:, :2]), poses[:, 2] + turn])
-    if current is not None:
-        x, y = motion.apply(np.array([current[:2]]))[0]
-        current = Pose(float(x), float(y), current.theta_rad + turn)
-    landmarks = motion.apply(landmarks)
-    return _Placed(moved, truth, current, f"truth: ATE {_metres(ate)}, {how}", landmarks)
+    how = f"scaled by {1.0 / motion.scale:.3g}" if mode == "similarity" else "not aligned"
+    walls_there = motion.undo(segments.reshape(-1, 2)).reshape(-1, 2, 2)
+    return _Truth(motion.undo(truth), walls_there, f"truth: ATE {_metres(ate)}, {how}")
 
 
-def draw_odometry(axes: Axes, xy: np.ndarray) -> None:
-    """Draw a dead-reckoned track ``(k, 2)``."""
-    axes.plot(*xy.T, color=ODOMETRY, lw=1.1, label="odometry")
+def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "") -> None:
+    """Draw a dead-reckoned track ``(k, 2)``, and say in the legend which session's it is."""
+    axes.plot(*xy.T, color=ODOMETRY, lw=1.1, label=f"odometry of {whose}" if whose else "odometry")
     _draw_ends(axes, xy)
     write_title(axes, "Odometry alone", f"{counted(len(xy), 'frame')} · {path_length(xy):,.1f} m")
     _metric(axes)
@@ -111,40 +111,66 @@ def draw_map(
     walls: np.ndarray | None,
     current: Pose | None,
     landmarks: np.ndarray | None = None,
+    session: np.ndarray | None = None,
+    names: Sequence[str] = (),
 ) -> None:
-    """Draw experiences, links, loop closures, landmarks, truth and robot, where the truth is."""
+    """Draw experiences, links, loop closures, landmarks and robot, and the truth laid over them."""
     poses, links = np.asarray(poses).reshape(-1, 3), np.asarray(links, np.int64).reshape(-1, 2)
+    xy, is_loop = poses[:, :2], closes_loop(links[:, 0], links[:, 1])
+    counts = ((len(xy), "experience"), (len(links), "link"), (int(is_loop.sum()), "loop closure"))
+    write_title(axes, "Experience map", " · ".join(counted(*count) for count in counts))
+    if not len(xy):
+        axes.text(0.5, 0.5, "no places", transform=axes.transAxes, ha="center", va="center")
+        axes.set(xticks=[], yticks=[])
+        return
+    true = _lay(xy if track is None else track, truth, walls)
     spots = np.empty((0, 2)) if landmarks is None else np.asarray(landmarks).reshape(-1, 2)
-    poses, truth, current, truth_label, spots = _place(poses, track, truth, current, spots)
-    xy = poses[:, :2]
-    if walls is not None:
-        segments = np.asarray(walls).reshape(-1, 2, 2)
-        axes.add_collection(LineCollection(segments, colors=WALL, lw=2.5, zorder=1, label="walls"))
-    is_loop = closes_loop(links[:, 0], links[:, 1])
-    axes.add_collection(
-        LineCollection(xy[links[~is_loop]], colors=MAP, lw=0.9, alpha=0.8, zorder=2)
-    )
-    dot = float(np.clip(50.0 / math.sqrt(max(1, len(xy))), 2.0, 4.5))
-    axes.plot(*xy.T, ls="none", marker="o", ms=dot, mew=0, color=MAP, zorder=3)
-    axes.plot([], [], "-o", color=MAP, lw=0.9, ms=4, label="experiences, links")
+    if len(true.walls):
+        lines = LineCollection(true.walls, colors=WALL, lw=2.5, zorder=1, label="walls")
+        axes.add_collection(lines)
+    _draw_places(axes, xy, links[~is_loop], session, names)
     if is_loop.any():
         axes.add_collection(
             LineCollection(xy[links[is_loop]], colors=LOOP, lw=1.3, zorder=4, label="loop closure")
         )
-    if truth is not None:
-        axes.plot(*truth.T, "--", color=TRUTH, lw=0.9, zorder=5, label=truth_label)
+    if true.xy is not None:
+        axes.plot(*true.xy.T, "--", color=TRUTH, lw=0.9, zorder=5, label=true.label)
     if len(spots):
         style = {"ls": "none", "marker": "*", "ms": 10, "mfc": LANDMARK, "mec": INK, "mew": 0.5}
         axes.plot(*spots.T, zorder=6, label="landmarks", **style)
     _draw_ends(axes, xy, end=current is None)
     if current is not None:
-        marker = MarkerStyle(_DART).rotated(rad=current.theta_rad)
-        style = {"ls": "none", "marker": marker, "ms": 13, "mfc": ROBOT, "mec": INK, "mew": 0.8}
-        axes.plot(*current[:2], zorder=8, label="robot now", **style)
+        draw_robot(axes, current, "robot now")
     axes.autoscale_view()
-    counts = ((len(xy), "experience"), (len(links), "link"), (int(is_loop.sum()), "loop closure"))
-    write_title(axes, "Experience map", " · ".join(counted(*count) for count in counts))
     _metric(axes)
+
+
+def draw_robot(axes: Axes, pose: Pose, label: str) -> None:
+    """Draw a dart where a robot is, pointing where it heads."""
+    marker = MarkerStyle(_DART).rotated(rad=pose.theta_rad)
+    style = {"ls": "none", "marker": marker, "ms": 13, "mfc": ROBOT, "mec": INK, "mew": 0.8}
+    axes.plot(*pose[:2], zorder=8, label=label, **style)
+
+
+def _draw_places(
+    axes: Axes,
+    xy: np.ndarray,
+    links: np.ndarray,
+    session: np.ndarray | None,
+    names: Sequence[str],
+) -> None:
+    """Draw experiences and the links between neighbours in time, by session where there are."""
+    whose = np.zeros(len(xy), np.int64) if session is None else np.asarray(session)
+    maker = whose[links].max(axis=1)  # the later one made it
+    style = {"ls": "none", "marker": "o", "mew": 0, "zorder": 3}
+    style["ms"] = float(np.clip(50.0 / math.sqrt(max(1, len(xy))), 2.0, 4.5))
+    for number, name in enumerate(names or ["experiences, links"]):
+        colour, mine = SESSIONS[number % len(SESSIONS)], xy[whose == number]
+        lines = xy[links[maker == number]]
+        axes.add_collection(LineCollection(lines, colors=colour, lw=0.9, alpha=0.8, zorder=2))
+        axes.plot(*mine.T, color=colour, **style)
+        label = name if len(mine) else f"{name}: no place of its own"
+        axes.plot([], [], "-o", color=colour, lw=0.9, ms=4, label=label)
 
 
 def _draw_ends(axes: Axes, xy: np.ndarray, end: bool = True) -> None:
@@ -212,36 +238,51 @@ def draw_template(axes: Axes, template: np.ndarray, error: float, template_id: i
 
 
 def draw_signals(
-    axes: Sequence[Axes], frames: Mapping[str, np.ndarray], threshold: float | None
+    figure: Figure | SubFigure, frames: Mapping[str, np.ndarray], threshold: float | None
 ) -> None:
-    """Draw match errors, and counts, over time."""
+    """Draw match errors, where there were views, and counts, over time."""
+    has_views = bool(np.any(frames["n_templates"]))
+    axes = figure.subplots(1 + has_views, 1, sharex=True, squeeze=False)[:, 0]
+    if has_views:
+        _draw_recognition(axes[0], frames, threshold)
+    columns = (("n_links", LOOP), ("n_experiences", MAP), ("n_templates", OTHER))
+    for name, colour in columns[: 2 + has_views]:
+        counts = np.asarray(frames[name])
+        last = int(counts[-1]) if len(counts) else 0
+        axes[-1].plot(frames["time_s"], counts, color=colour, lw=1.6, label=f"{last:,} {name[2:]}")
+    axes[-1].set(xlabel="time (s)", ylabel="count")
+    axes[-1].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes[-1].yaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
+    axes[-1].set_ylim(0, max(1.0, axes[-1].get_ylim()[1]))
+    write_title(axes[-1], "Memory")
+    _legend_above(axes[-1])
+
+
+def _draw_recognition(
+    axes: Axes, frames: Mapping[str, np.ndarray], threshold: float | None
+) -> None:
     time = np.asarray(frames["time_s"], np.float64)
     error = np.asarray(frames["match_error"], np.float64)
     error = np.where(error < 0, np.nan, error)
     is_new = np.zeros(len(error), bool) if threshold is None else error > threshold
     size = float(np.clip(80.0 / math.sqrt(max(1, len(time))), 2.5, 6.0))
     dots = {"ls": "none", "marker": ".", "ms": size, "mew": 0}
-    axes[0].plot(time[~is_new], error[~is_new], color=MAP, label="known view", **dots)
+    axes.plot(time[~is_new], error[~is_new], color=MAP, label="known view", **dots)
     if threshold is not None:
-        axes[0].plot(time[is_new], error[is_new], color=LOOP, label="new view", **dots)
-        axes[0].axhline(threshold, color=INK, lw=0.9, ls="--", label=f"threshold {threshold:g}")
-    axes[0].set(ylabel="match error")
-    axes[0].set_ylim(bottom=0.0)
-    write_title(axes[0], "Recognition")
-    for name, colour in (("n_links", LOOP), ("n_experiences", MAP), ("n_templates", OTHER)):
-        counts = np.asarray(frames[name])
-        last = int(counts[-1]) if len(counts) else 0
-        axes[1].plot(time, counts, color=colour, lw=1.6, label=f"{last:,} {name[2:]}")
-    axes[1].set(xlabel="time (s)", ylabel="count")
-    axes[1].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    axes[1].set_ylim(bottom=0)
-    write_title(axes[1], "Memory")
-    for ax in axes:
-        ax.margins(x=0.01)
-        style = {"columnspacing": 0.9, "handletextpad": 0.4, "handlelength": 1.1, "fontsize": 8}
-        ax.legend(
-            loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=3, markerscale=8.0 / size, **style
-        )
+        axes.plot(time[is_new], error[is_new], color=LOOP, label="new view", **dots)
+        axes.axhline(threshold, color=INK, lw=0.9, ls="--", label=f"threshold {threshold:g}")
+    axes.set(ylabel="match error")
+    axes.set_ylim(bottom=0.0)
+    write_title(axes, "Recognition")
+    _legend_above(axes, markerscale=8.0 / size)
+
+
+def _legend_above(axes: Axes, markerscale: float = 1.0) -> None:
+    axes.margins(x=0.01)
+    style = {"columnspacing": 0.9, "handletextpad": 0.4, "handlelength": 1.1, "fontsize": 8}
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=3, markerscale=markerscale, **style
+    )
 
 
 def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
@@ -262,7 +303,9 @@ def _metric(axes: Axes) -> None:
     if np.ptp(seen, axis=0).max() < 0.1:  # a point, or nothing, has no extent of its own
         axes.update_datalim(seen.mean(axis=0) + np.array([[-0.05, -0.05], [0.05, 0.05]]))
         axes.autoscale_view()
-    legend_below(axes, columns=4 if len(axes.get_legend_handles_labels()[0]) < 5 else 3)
+    labels = axes.get_legend_handles_labels()[1]
+    many = 4 if len(labels) < 5 else 3
+    legend_below(axes, columns=1 if max(map(len, labels), default=0) > 36 else many)
 
 
 def write_title(axes: Axes, name: str, counts: str = "") -> None:
@@ -283,9 +326,38 @@ def as_rgb(image: np.ndarray) -> np.ndarray:
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
-def counted(n: int, noun: str) -> str:
-    """Say how many, in the singular where it is one."""
-    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+def write_decimals(axis: Axis) -> None:
+    """Write few and plain numbers on a logarithmic axis.
+
+    Example:
+        >>> axes = new_figure(3.0, 3.0, None).subplots()
+        >>> _ = axes.set(yscale="log", ylim=(0.01, 10.0))
+        >>> write_decimals(axes.yaxis)
+        >>> [axes.yaxis.get_major_formatter()(tick) for tick in (0.01, 0.1, 1.0, 10.0)]
+        ['0.01', '0.1', '1', '10']
+    """
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low)
+    few = LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 2.0, 5.0))
+    axis.set_major_locator(few if decades > 1.0 else MaxNLocator(5))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def plain_text(text: str) -> str:
+    """Write a name as it is: a $ would begin a formula."""
+    return text.replace("$", r"\$")
+
+
+def shortened(name: str, most: int = 44) -> str:
+    """Cut the middle out of a long name: sources differ where they begin or end.
+
+    Example:
+        >>> shortened("world:ellipse?laps=2&seed=1", 20)
+        'world:el … =2&seed=1'
+    """
+    half = (most - 3) // 2
+    return name if len(name) <= most else f"{name[:half]} … {name[half - most + 3 :]}"
 
 
 def _metres(distance: float) -> str:

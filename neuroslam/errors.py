@@ -24,7 +24,7 @@ def counted(n: int, one: str, several: str = "") -> str:
         >>> counted(1, "place is", "places are")
         '1 place is'
     """
-    return f"{n} {one if n == 1 else several or one + 's'}"
+    return f"{n:,} {one if n == 1 else several or one + 's'}"
 
 
 class NeuroslamError(Exception):

@@ -13,14 +13,16 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import BrainConfig
+from neuroslam.drawing import SESSIONS, plain_text, shortened
 from neuroslam.errors import MapError, NeuroslamError, RunError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.merge_drawing import SESSIONS, Stage, plot_stages
+from neuroslam.merge_drawing import Stage, plot_stages
 from neuroslam.merging import merge_runs
 from neuroslam.parallel import outcomes
 from neuroslam.plotting import save
 from neuroslam.run_files import (
     OnBadFrame,
+    RunPlan,
     brain_file,
     read_trace,
     require_free,
@@ -252,7 +254,7 @@ def _pairs(free: Sequence[Part], tried: set[tuple[Part, Part]]) -> Iterator[tupl
 def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
     """Copy the largest map to its place, measure it, say what stayed apart, and draw."""
     most = max(parts, key=lambda part: len(part.sessions), default=None)
-    stages = []
+    stages, made = [], set()
     if most is not None and len(most.sessions) > 1:
         _copy(out / most.folder, out / MERGED)
         brain = load_brain(out / MERGED / "brain.safetensors")
@@ -277,7 +279,9 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
             report.apart.append(
                 {"sessions": list(part.sessions), "folder": part.folder, "reasons": reasons}
             )
-        stages.append((part is most, _stage(part, out, report)))
+        stage, makers = _stage(part, out, report)
+        stages.append((part is most, stage))
+        made |= makers
     text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False) + "\n"
     if stages:
         stages.sort(key=lambda stage: not stage[0])
@@ -288,8 +292,19 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
         title += f", {len(report.failed)} failed" if report.failed else ""
         if len(report.sessions) > len(SESSIONS):
             title += f"; colours repeat after {len(SESSIONS)} sessions"
-        save(plot_stages([stage for _, stage in stages], title), out / "fleet.png")
+        figure = plot_stages([stage for _, stage in stages], title, _names(report, made))
+        save(figure, out / "fleet.png")
     write_text(out / REPORT, text)
+
+
+def _names(report: FleetReport, made: set[int]) -> list[str]:
+    """Name each session by its source; and say which made none of the places drawn, and why."""
+    names = []
+    for row in report.sessions:
+        name = plain_text(f"{row['session']}: {shortened(RunPlan(row['source']).name)}")
+        without = "failed" if row["error"] else "no place of its own"
+        names.append(name if row["session"] in made else f"{name}, {without}")
+    return names
 
 
 def _copy(source: Path, to: Path) -> None:
@@ -321,19 +336,21 @@ def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport)
         return
 
 
-def _stage(part: Part, out: Path, report: FleetReport) -> Stage:
+def _stage(part: Part, out: Path, report: FleetReport) -> tuple[Stage, set[int]]:
+    """Return a map as it is drawn, and the sessions that made its places."""
     brain = load_brain(brain_file(out / part.folder))
     ids = {  # a robot that is carried, or whose recording has a gap, has several
-        session.id: row["session"] - 1
+        session.id: row["session"]
         for row in report.sessions
         if row["session"] in part.sessions
         for session in load_brain(brain_file(out / row["folder"])).sessions.sessions
     }
     links = brain.map.links
-    numbers = [ids[one] % len(SESSIONS) for one in brain.map.experiences["session"].tolist()]
-    return Stage(
+    makers = [ids[one] for one in brain.map.experiences["session"].tolist()]
+    stage = Stage(
         f"{'session' if len(part.sessions) == 1 else 'sessions'} {part}",
         brain.map.poses,
         np.column_stack([links.source, links.target]),
-        np.array(numbers, dtype=np.int64),
+        (np.array(makers, dtype=np.int64) - 1) % len(SESSIONS),
     )
+    return stage, set(makers)

@@ -68,7 +68,6 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
     written = datetime.fromtimestamp(status.st_mtime, UTC)
     places = brain.map.poses[:, :2]
     width, height = np.ptp(places, axis=0) if len(places) else (0.0, 0.0)
-    view, cells = config.view, config.pose_cells
     rows = [
         ("file", str(file)),
         ("format", str(about["format"])),
@@ -79,13 +78,8 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("extent", f"{width:.2f} m x {height:.2f} m"),
         ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
-        (
-            "view",
-            f"{view.template_width} x {view.template_height} px of {view.features}, "
-            f"threshold {view.threshold}",
-        ),
         ("cells", "+".join(config.cells)),
-        ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
+        *(_views(config) if config.has("pose") else []),
     ]
     origins = brain.map.origins()
     made = Counter(origins.session.tolist())
@@ -104,12 +98,24 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
 def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
     links = brain.map.links
     return [
-        ("views", str(brain.view.n)),
+        *([("views", str(brain.view.n))] if brain.config.has("pose") else []),
         ("experiences", str(brain.map.n)),
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
         *_navigation_counts(brain),
         *([("landmarks", str(brain.semantic.n))] if brain.config.has("semantic") else []),
+    ]
+
+
+def _views(config: BrainConfig) -> list[tuple[str, str]]:
+    view, cells = config.view, config.pose_cells
+    return [
+        (
+            "view",
+            f"{view.template_width} x {view.template_height} px of {view.features}, "
+            f"threshold {view.threshold}",
+        ),
+        ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
     ]
 
 

@@ -18,10 +18,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from neuroslam.drawing import INK, MAP, OTHER, ROBOT, STYLE, TRUTH, counted, new_figure
+from neuroslam.drawing import INK, ROBOT, SESSIONS, STYLE, TRUTH, new_figure
+from neuroslam.errors import counted
 from neuroslam.evaluation.trajectory import path_length
 
-SESSIONS = (MAP, ROBOT, OTHER, "#CC79A7", "#56B4E9", "#882255")
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
 MATCH, REFERENCE, SHADOW = "#DD1122", "#7B3FA0", "#c2c2c2"
 _NO_POINTS = np.zeros((0, 2))
@@ -68,7 +68,9 @@ class Bindings(NamedTuple):
     matched: np.ndarray = np.zeros((0, 3))
 
 
-def plot_stages(stages: Sequence[Stage], title: str | None = None) -> Figure:
+def plot_stages(
+    stages: Sequence[Stage], title: str | None = None, names: Sequence[str] = ()
+) -> Figure:
     """Draw how maps of several sessions became one, a panel for each stage.
 
     All panels have one scale, but one with unlinked maps shows as much as it needs. Such a map has
@@ -78,6 +80,7 @@ def plot_stages(stages: Sequence[Stage], title: str | None = None) -> Figure:
     Args:
         stages: In the order of time; three in a row.
         title: Heading of the whole figure.
+        names: Of all sessions, for the legend; without, those that are seen are numbered there.
 
     Raises:
         ValueError: If there is no stage, or sessions do not fit the experiences.
@@ -100,7 +103,7 @@ def plot_stages(stages: Sequence[Stage], title: str | None = None) -> Figure:
             _say(axes, stage.title, _counts(stage), *_moved(stage, moves))
             _frame(axes, box, window)
         parts = [part for stage in stages for part in (stage, *stage.others)]
-        key = _session_key(part.session for part in parts)
+        key = _session_key((part.session for part in parts), names)
         marks = [any(len(p.starts) for p in parts), any(len(p.ends) for p in parts)]
         key += [_mark(kind) for kind, seen in zip("XD", marks, strict=True) if seen]
         if any(len(part.merge_points) for part in parts):
@@ -361,11 +364,13 @@ def _mark(kind: str) -> Line2D:
     return Line2D([], [], label=label, **_look(kind, "#8c8c8c"))
 
 
-def _session_key(sessions: Iterable[np.ndarray]) -> list[Line2D]:
+def _session_key(sessions: Iterable[np.ndarray], names: Sequence[str] = ()) -> list[Line2D]:
     seen = sorted({int(number) for session in sessions for number in np.unique(session)})
+    labels = dict(enumerate(names)) or {n: f"{ORDINALS[n]} session" for n in seen}
+    style = {"marker": "o", "ms": 5, "lw": 1.6}
     return [
-        Line2D([], [], marker="o", ms=5, lw=1.6, color=SESSIONS[n], label=f"{ORDINALS[n]} session")
-        for n in seen
+        Line2D([], [], color=SESSIONS[n % len(SESSIONS)], label=label, **style)
+        for n, label in labels.items()
     ]
 
 
@@ -389,8 +394,9 @@ def _grid(
 
 def _finish(figure: Figure, key: list[Line2D], window: np.ndarray) -> Figure:
     """Write the legend below, then give the figure the height its panels need in their width."""
-    width = sum(0.075 * len(line.get_label()) + 0.6 for line in key)
-    columns = math.ceil(len(key) / max(1, math.ceil(width / figure.get_figwidth())))
+    widths, wide = [0.075 * len(line.get_label()) + 0.6 for line in key], figure.get_figwidth()
+    columns = math.ceil(len(key) / max(1, math.ceil(sum(widths) / wide)))
+    columns = max(1, min(columns, int(wide / max(widths, default=1.0))))
     if key:
         figure.legend(handles=key, loc="outside lower center", ncols=columns)
     figure.draw_without_rendering()

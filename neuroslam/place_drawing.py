@@ -27,11 +27,14 @@ from neuroslam.drawing import (
     STYLE,
     TRUTH,
     counted,
+    draw_robot,
+    legend_below,
     new_figure,
     write_title,
 )
 from neuroslam.evaluation.trajectory import path_length
 from neuroslam.sensors.arena import Arena
+from neuroslam.types import Pose
 
 _ABOVE = 0.5  # share of the strongest response, above which a cell counts as responding
 _MARK = {"color": INK, "lw": 1.2, "ls": ":", "zorder": 4}
@@ -118,6 +121,44 @@ def plot_place_maps(
             Line2D([], [], color="#cccccc", lw=1.2, label="true path"),
         ]
         figure.legend(handles=key, loc="outside lower center", ncols=2)
+    return figure
+
+
+def plot_place_cells(
+    centres_m: np.ndarray,
+    links: np.ndarray,
+    walls_m: np.ndarray,
+    here: Pose,
+    path_m: np.ndarray,
+) -> Figure:
+    """Draw place cells, the links between them and walls, where an animal believes them to be.
+
+    Args:
+        centres_m: Of the place cells, ``(n, 2)``.
+        links: Two places each, ``(m, 2)``.
+        walls_m: A point of each remembered stretch of wall, ``(w, 2)``.
+        here: Where the animal is now.
+        path_m: Where it was, ``(k, 2)``: a faint line.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(6.0, 6.0, None)
+        axes = figure.subplots()
+        axes.plot(*path_m.T, color=ODOMETRY, lw=0.4, alpha=0.5, zorder=1, label="path")
+        _draw_places(axes, centres_m, links)
+        axes.plot(
+            [], [], "o-", color=MAP, ms=4, lw=0.8, label=counted(len(centres_m), "place cell")
+        )
+        if len(walls_m):
+            style = {"ls": "none", "marker": "s", "ms": 3.5, "color": LOOP, "zorder": 4}
+            axes.plot(
+                *walls_m.T, label=f"remembered wall, in {counted(len(walls_m), 'part')}", **style
+            )
+        draw_robot(axes, here, "the animal now")
+        axes.set(xlabel="x (m)", ylabel="y (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.05)
+        write_title(axes, "Place cells, and walls as remembered" if len(walls_m) else "Place cells")
+        legend_below(axes, columns=2)
     return figure
 
 

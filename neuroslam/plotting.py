@@ -4,6 +4,7 @@
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -34,7 +35,8 @@ from neuroslam.types import Pose, PoseEstimate
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Write a figure as PNG, whole or not at all; equal figures give equal bytes."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a name in a script that no font has
         write_atomically(
             Path(path),
             lambda file: figure.savefig(
@@ -46,7 +48,8 @@ def save(figure: Figure, path: Path, dpi: int = 150) -> None:
 def render(figure: Figure, dpi: int = 100) -> np.ndarray:
     """Draw a figure into pixels: ``uint8``, ``(h, w, 3)``."""
     figure.set_dpi(dpi)
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")
         figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
@@ -61,13 +64,17 @@ def plot_map(
     walls: np.ndarray | None = None,
     current: Pose | None = None,
     landmarks: np.ndarray | None = None,
+    session: np.ndarray | None = None,
+    session_names: Sequence[str] = (),
+    odometry_of: str = "",
     title: str | None = None,
 ) -> Figure:
     """Draw the experience map, beside the odometry it was made from.
 
     A link is a loop closure when it joins experiences that were both known before.
-    With ``truth_xy`` the map is drawn where a similarity alignment to the truth puts it, and the
-    legend gives the absolute trajectory error (RMSE).
+    The map is in its own coordinates. ``truth_xy``, and walls with it, are drawn where a similarity
+    alignment lays them over the track, and the legend gives the absolute trajectory error (RMSE,
+    in metres of the truth).
 
     Args:
         poses: Experiences ``(n, 3)``: x, y in metres, heading in radians.
@@ -78,17 +85,24 @@ def plot_map(
         walls: Ends of wall segments in the frame of the truth, ``(w, 2, 2)``.
         current: Pose of the robot now, on the map: an arrow, which stands for the end.
         landmarks: Where landmarks are, on the map, ``(l, 2)``: stars.
+        session: Number of the session that made each experience, ``(n,)``, from 0: its colour.
+        session_names: Of the sessions, for the legend; colours repeat after six.
+        odometry_of: Whose odometry it is, for the legend.
         title: Heading of the whole figure.
 
     Raises:
         ValueError: If the truth has another length than the track.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(11.0 if odometry_xy is not None else 6.2, 5.6, title)
+        tall = 5.6 + 0.19 * len(session_names)  # a line of the legend each
+        figure = new_figure(11.0 if odometry_xy is not None else 6.2, tall, title)
         axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
-            draw_odometry(axes[0], np.asarray(odometry_xy))
-        draw_map(axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks)
+            draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of)
+        draw_map(
+            axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks, session,
+            session_names,
+        )  # fmt: skip
     return figure
 
 
@@ -132,7 +146,7 @@ def plot_frame_and_template(
 
 
 def plot_signals(frames: Mapping[str, np.ndarray], threshold: float | None = None) -> Figure:
-    """Draw how well frames were recognised, and how the map grew, over time.
+    """Draw how well frames were recognised, where there were views, and how the map grew.
 
     Args:
         frames: The columns ``time_s``, ``match_error``, ``n_templates``, ``n_experiences`` and
@@ -140,8 +154,8 @@ def plot_signals(frames: Mapping[str, np.ndarray], threshold: float | None = Non
         threshold: Largest match error that counts as known.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(8.0, 4.8, None)
-        draw_signals(figure.subplots(2, 1, sharex=True), frames, threshold)
+        figure = new_figure(8.0, 4.8 if np.any(frames["n_templates"]) else 2.7, None)
+        draw_signals(figure, frames, threshold)
     return figure
 
 
@@ -245,5 +259,5 @@ def plot_summary(
             if template is not None:
                 error, name = float(frames["match_error"][-1]), int(frames["template"][-1])
                 draw_template(axes[1], template, error, name)
-        draw_signals(parts.pop(0).subplots(2, 1, sharex=True), frames, threshold)
+        draw_signals(parts.pop(0), frames, threshold)
     return figure

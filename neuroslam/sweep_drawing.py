@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter
 
-from neuroslam.drawing import CURVES, ODOMETRY, STYLE, counted, new_figure
+from neuroslam.drawing import CURVES, ODOMETRY, STYLE, new_figure
+from neuroslam.errors import counted
 
 _PANELS = {
     "ate_rmse_m": "absolute trajectory error (m)",

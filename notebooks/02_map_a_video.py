@@ -248,7 +248,7 @@ plot_map(
 
 # %% [markdown]
 # Without scaling (rigid) the map is farther off: how long a metre is comes from odometry, and no loop
-# can tell. The figure scales it, and says by how much.
+# can tell. The figure scales truth and walls, and says by how much.
 #
 # ## A harder drive
 # The same two laps, but the light changes and four people walk about.

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from neuroslam.comparison_drawing import plot_losses
 from neuroslam.experiments.compare import (
     LANDMARKS,
     LOSSES,
@@ -14,6 +15,7 @@ from neuroslam.experiments.compare import (
     live,
     pixel_landmarks,
 )
+from neuroslam.plotting import render
 from neuroslam.sensors import open_source
 
 
@@ -41,6 +43,14 @@ def test_what_is_lost_is_told_of_the_whole_drive_and_of_its_end(results):
     for row in results[0]["losses"]:
         assert row["ate_last_lap_m"] <= row["largest_error_m"]
         assert row["ate_m"] <= row["largest_error_m"]
+
+
+def test_errors_over_time_are_written_as_decimals():
+    curves = {"nothing is lost": {"full": np.array([0.02, 0.3, 9.0, 40.0])}}
+    figure = plot_losses(curves, LOSSES)
+    render(figure)
+    ticks = [text.get_text() for text in figure.get_axes()[0].get_yticklabels()]
+    assert {"0.1", "1", "10"} <= set(ticks) <= {"0.001", "0.01", "0.1", "1", "10", "100"}
 
 
 def test_methods_are_what_their_names_say():

@@ -10,7 +10,7 @@ from neuroslam import load_brain
 from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
-from neuroslam.fleets import FleetReport, Part, _pairs, fleet
+from neuroslam.fleets import FleetReport, Part, _names, _pairs, fleet
 from neuroslam.run_files import RUN_FILES, TIMINGS
 
 LOOK = "width=128&height=32"
@@ -106,6 +106,22 @@ def test_two_at_once_give_the_maps_of_one_after_the_other(done, tmp_path):
     assert (tmp_path / "two" / "fleet.png").read_bytes() == (out / "fleet.png").read_bytes()
     assert told[4] == ("sessions", 5, 5)
     assert {what for what, _, _ in told[5:]} == {f"merges, level {k}" for k in (1, 2, 3)}
+
+
+def test_the_legend_names_every_source_and_says_which_brought_no_place():
+    sources = ("a/monday.mp4", "b/c/tuesday.mp4", "world:ellipse?look=$1", "gone.mp4")
+    report = FleetReport(
+        [
+            {"session": k, "source": source, "error": "no such file" if k == 4 else ""}
+            for k, source in enumerate(sources, start=1)
+        ]
+    )
+    assert _names(report, {1, 3}) == [
+        "1: a/monday.mp4",
+        "2: c/tuesday.mp4, no place of its own",
+        r"3: world:ellipse?look=\$1",
+        "4: gone.mp4, failed",
+    ]
 
 
 # --- the command --------------------------------------------------------------------------------

@@ -128,6 +128,14 @@ def test_what_is_told_of_a_brain_is_what_it_holds(joined):
     )
 
 
+@pytest.mark.parametrize("cells", [("place",), ("semantic",)])
+def test_views_and_pose_cells_are_not_told_of_a_brain_without(cells, tmp_path):
+    save_brain(NavigationBrain(BrainConfig(cells=cells)), tmp_path / "brain.safetensors")
+    told = dict(inspect(tmp_path / "brain.safetensors"))
+    assert told["cells"] == cells[0]
+    assert not {"view", "views", "pose cells"} & told.keys()
+
+
 def put(name, row, value):
     def alter(state):
         if state[name].dim():

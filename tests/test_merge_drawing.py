@@ -7,8 +7,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from mpl_toolkits.mplot3d.art3d import Line3D, Line3DCollection
 
+from neuroslam import drawing, plotting
 from neuroslam import merge_drawing as md
-from neuroslam import plotting
 
 TORUS = (21, 21, 36)
 
@@ -216,7 +216,10 @@ def test_every_experience_and_link_is_drawn_in_the_colour_of_its_session():
         assert as_rows(nodes(axes, md.SESSIONS[number])) == as_rows(mine)
     lines = [c for c in axes.collections if isinstance(c, LineCollection)]
     by_colour = {to_hex(c.get_color()[0]): len(c.get_segments()) for c in lines}
-    assert by_colour == {md.MAP.lower(): 39, md.ROBOT.lower(): 31}  # a bridge is of the later one
+    assert by_colour == {
+        drawing.MAP.lower(): 39,
+        drawing.ROBOT.lower(): 31,
+    }  # a bridge is of the later one
     assert [len(markers(axes, kind)) for kind in "XD"] == [2, 2]
     assert np.array_equal(rings(axes)[0].get_xydata(), FINAL.merge_points)
 
@@ -262,6 +265,16 @@ def test_legends_name_what_is_there_and_nothing_else():
     assert legend_of(accuracy()) == ["first session", "second session", *everything[:2], "truth"]
     names = ["first session", "second session", *everything[:2], "match", "shadow on θ = 0"]
     assert legend_of(bindings()) == names
+
+
+def test_sessions_with_names_are_all_in_the_legend_whether_or_not_they_made_a_place():
+    names = ["1: monday.mp4", "2: tuesday.mp4", "3: a/very/long/name/of/a/video.mp4, no place"]
+    figure = md.plot_stages([FINAL._replace(starts=(), ends=(), merge_points=())], None, names)
+    assert legend_of(figure) == names
+    colours = [to_hex(line.get_color()) for line in figure.legends[0].get_lines()]
+    assert colours == [colour.lower() for colour in md.SESSIONS[:3]]
+    plotting.render(figure)
+    assert figure.legends[0].get_window_extent().x1 < figure.bbox.x1
 
 
 def test_six_sessions_are_named_in_order():

@@ -11,13 +11,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from neuroslam import load_brain, run
+from neuroslam import load_brain, review, run
 from neuroslam.brain.merge import MergeReport
 from neuroslam.cli import main
-from neuroslam.run_files import RUN_FILES, read_frames
+from neuroslam.run_files import RUN_FILES, RunPlan, read_frames
 
 WORLD = "world:ellipse?laps=2&width=128&height=32"
 OTHER = "world:corridor?laps=1&width=128&height=32"
@@ -62,6 +63,21 @@ def merged(runs, tmp_path_factory):
     return out
 
 
+@pytest.fixture
+def drawn(monkeypatch):
+    """Draw ``map.png`` of a run: its title, and the names in the legend of each panel."""
+
+    def draw(out):
+        figures = []
+        monkeypatch.setattr(review, "save", lambda figure, _path: figures.append(figure))
+        review.plot(out, out)
+        legends = [axes.get_legend() for axes in figures[0].get_axes()]
+        names = [[text.get_text() for text in legend.get_texts()] for legend in legends]
+        return figures[0].get_suptitle(), *names
+
+    return draw
+
+
 # --- merged -------------------------------------------------------------------------------------
 
 
@@ -75,6 +91,32 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
     assert {path.name for path in out.iterdir()} == set(RUN_FILES)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     assert (contents(runs / "a"), contents(runs / "b")) == before
+
+
+def test_the_map_of_a_merge_names_its_sessions_and_whose_odometry_is_beside_it(merged, drawn):
+    title, odometry, names = drawn(merged)
+    assert title == f"2 sessions on one map: {WORLD}"
+    first, second = f"{WORLD} from frame 0", f"{WORLD} from frame 100"
+    assert odometry[0] == f"odometry of {second}"
+    assert names[:2] == [first, second]
+
+
+def test_a_run_alone_is_titled_by_its_source_and_its_frames(runs, drawn):
+    title, odometry, names = drawn(runs / "a")
+    assert title == f"{WORLD}: 200 frames"
+    assert (odometry[0], names[0]) == ("odometry", "experiences, links")
+
+
+def test_the_map_says_how_many_frames_are_on_maps_that_were_not_joined(runs):
+    brain, plan = load_brain(runs / "a" / "brain.safetensors"), RunPlan("long/way/drive.mp4")
+    on_map = np.arange(1000) < 28
+    brain.store(load_brain(runs / "elsewhere" / "brain.safetensors"))
+    assert review._title(brain, plan, on_map).splitlines() == [
+        "way/drive.mp4: 1,000 frames",
+        "972 of 1,000 frames are on maps that were not joined",
+    ]
+    all_here = review._title(brain, plan, on_map[:28])
+    assert all_here == "way/drive.mp4: 28 frames\n1 stored map was not joined"
 
 
 def test_all_files_of_a_merge_tell_the_same(runs, merged):

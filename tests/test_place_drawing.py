@@ -6,6 +6,7 @@ import pytest
 from neuroslam import place_drawing as pd
 from neuroslam.plotting import render, save
 from neuroslam.sensors.arena import named_arena
+from neuroslam.types import Pose
 
 ARENA = named_arena("circle2m")
 RNG = np.random.default_rng(0)
@@ -46,6 +47,18 @@ def test_a_map_of_one_place_can_be_drawn():
     figure = pd.plot_place_maps([[one]], ARENA, PATH)
     assert figure.axes[0].get_title("right") == "1 place"
     assert render(figure).std() > 0
+
+
+def test_place_cells_are_drawn_with_the_walls_that_are_remembered_where_there_are():
+    here, feet = Pose(0.1, 0.2, 0.0), np.array([[1.0, 0.0], [0.0, 1.0]])
+    (axes,) = pd.plot_place_cells(CENTRES, LINKS, feet, here, PATH).axes
+    said = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+    np.testing.assert_array_equal(said["remembered wall, in 2 parts"], feet)
+    np.testing.assert_array_equal(said["the animal now"], [here[:2]])
+    assert "40 place cells" in said
+    (bare,) = pd.plot_place_cells(CENTRES, LINKS, np.empty((0, 2)), here, PATH).axes
+    assert bare.get_title("left") == "Place cells"
+    assert not any("wall" in line.get_label() for line in bare.get_lines())
 
 
 def test_paths_tell_their_mean_error_and_the_remembered_walls():

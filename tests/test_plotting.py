@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
+from matplotlib.font_manager import fontManager
 
 from neuroslam import drawing, plotting
 from neuroslam.geometry import integrate_velocities
@@ -190,19 +191,44 @@ def test_the_legend_lies_below_the_data():
         assert axes.get_legend().get_window_extent().y1 < axes.bbox.y0
 
 
-def test_with_the_truth_known_the_map_is_laid_over_it_and_the_error_is_in_the_legend():
+def test_the_map_stays_where_it_is_and_the_truth_is_laid_over_it_with_its_walls_and_its_error():
     c, s = np.cos(0.5), np.sin(0.5)
     truth = 2.0 * SQUARE[:, :2] @ np.array([[c, -s], [s, c]]).T + [10.0, -5.0]
-    figure = plotting.plot_map(SQUARE, RING, truth_xy=truth, current=Pose(0.0, 1.0, 0.25))
+    here = Pose(0.0, 1.0, 0.25)
+    figure = plotting.plot_map(SQUARE, RING, truth_xy=truth, walls=[truth[:2]], current=here)
     axes = figure.get_axes()[0]
-    drawn = np.concatenate(segments(axes, drawing.LOOP))
-    np.testing.assert_allclose(drawn, truth[[3, 0]], atol=1e-9)
+    np.testing.assert_array_equal(segments(axes, drawing.LOOP)[0], SQUARE[[3, 0], :2])
+    np.testing.assert_allclose(segments(axes, drawing.WALL)[0], SQUARE[:2, :2], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
-    assert "truth: ATE 0.0 cm, map scaled by 2" in labels
+    laid = labels["truth: ATE 0.0 cm, scaled by 0.5"]
+    np.testing.assert_allclose(laid.get_xydata(), SQUARE[:, :2], atol=1e-9)
     robot = labels["robot now"]
-    np.testing.assert_allclose(robot.get_xydata()[0], truth[3], atol=1e-9)
+    np.testing.assert_array_equal(robot.get_xydata()[0], here[:2])
     tip = robot._marker.get_transform().transform((1.0, 0.0))
-    assert np.arctan2(tip[1], tip[0]) == pytest.approx(0.25 + 0.5)
+    assert np.arctan2(tip[1], tip[0]) == pytest.approx(0.25)
+
+
+def test_places_and_links_have_the_colour_of_their_session_which_the_legend_names():
+    names = ["monday.mp4", "tuesday.mp4", "wednesday.mp4"]
+    session = np.array([0, 0, 1, 1])
+    figure = plotting.plot_map(
+        SQUARE, RING, odometry_xy=SQUARE[2:, :2], session=session, session_names=names,
+        odometry_of="tuesday.mp4",
+    )  # fmt: skip
+    left, right = figure.get_axes()
+    dots = {
+        to_hex(line.get_color()): line.get_xydata()
+        for line in right.get_lines()
+        if line.get_ls() == "None" and line.get_label().startswith("_") and len(line.get_xydata())
+    }
+    assert list(dots) == [colour.lower() for colour in drawing.SESSIONS[:2]]
+    np.testing.assert_array_equal(dots[drawing.MAP.lower()], SQUARE[:2, :2])
+    assert [len(segments(right, colour)) for colour in drawing.SESSIONS[:2]] == [1, 2]
+    assert [text.get_text() for text in right.get_legend().get_texts()] == [
+        "monday.mp4", "tuesday.mp4", "wednesday.mp4: no place of its own", "loop closure", "start",
+        "end",
+    ]  # fmt: skip
+    assert left.get_legend().get_texts()[0].get_text() == "odometry of tuesday.mp4"
 
 
 def test_a_truth_that_does_not_fit_the_track_is_refused():
@@ -216,10 +242,14 @@ def test_a_robot_that_stood_still_is_drawn_where_it_stood():
     assert "truth: ATE 3.00 m, not aligned" in labels
 
 
-def test_a_map_without_a_single_experience_can_be_drawn():
-    figure = plotting.plot_map(np.empty((0, 3)), np.empty((0, 2)), odometry_xy=np.empty((0, 2)))
+def test_a_map_without_a_single_experience_says_so_and_shows_no_robot():
+    none, here = np.empty((0, 2)), Pose(0.0, 0.0, 0.0)
+    figure = plotting.plot_map(np.empty((0, 3)), none, odometry_xy=none, current=here)
     assert plotting.render(figure).std() > 0
-    assert figure.get_axes()[1].get_title("right") == "0 experiences · 0 links · 0 loop closures"
+    axes = figure.get_axes()[1]
+    assert axes.get_title("right") == "0 experiences · 0 links · 0 loop closures"
+    assert [text.get_text() for text in axes.texts] == ["no places"]
+    assert (len(axes.get_lines()), len(axes.get_xticks())) == (0, 0)
 
 
 def test_pose_cells_are_shown_from_above_and_from_the_side_with_all_their_activity():
@@ -241,6 +271,22 @@ def test_views_above_the_threshold_are_new_and_the_first_has_no_error():
     assert np.isfinite(known.get_ydata()).sum() + len(new.get_ydata()) == 39
     labels = [text.get_text() for text in figure.get_axes()[1].get_legend().get_texts()]
     assert labels == ["22 links", "21 experiences", "20 templates"]
+
+
+def test_without_views_there_is_no_recognition_and_no_count_of_templates():
+    blind = frames() | {"match_error": np.full(40, -1.0), "n_templates": np.zeros(40)}
+    (memory,) = plotting.plot_signals(blind, threshold=0.05).get_axes()
+    assert memory.get_title("left") == "Memory"
+    labels = [text.get_text() for text in memory.get_legend().get_texts()]
+    assert labels == ["22 links", "21 experiences"]
+
+
+def test_names_in_any_script_are_drawn_without_a_warning(tmp_path):
+    figure = plotting.plot_map(SQUARE, RING, title="東京 서울 🐀")
+    plotting.render(figure)
+    plotting.save(figure, tmp_path / "map.png")
+    there = set(fontManager.get_font_names())
+    assert set(drawing.STYLE["font.family"]) <= there
 
 
 def test_a_first_view_says_that_there_was_nothing_to_compare_with():

@@ -360,6 +360,20 @@ def test_plot_draws_the_map_again_and_two_more(whole, tmp_path):
         assert cv2.imread(str(path)).std() > 1
 
 
+@pytest.mark.parametrize(
+    ("cells", "figures"),
+    [
+        (["place"], ["place_cells.png"]),
+        (["semantic"], []),
+        (["pose", "place"], ["pose_cells.png", "place_cells.png"]),
+    ],
+)
+def test_plot_draws_the_cells_that_the_brain_has(cells, figures, tmp_path):
+    quiet_run(f"{WORLD}&ranges=36&markers=6", tmp_path / "run", BrainConfig(cells=cells), stop=8)
+    written = plot(tmp_path / "run", tmp_path / "figures")
+    assert [path.name for path in written] == ["map.png", *figures, "signals.png"]
+
+
 def test_overwriting_leaves_nothing_of_the_run_before(whole, tmp_path):
     out = shutil.copytree(whole[0], tmp_path / "run")
     with pytest.raises(RunError, match="holds a run already"):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,10 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, build_config, read_config_file, read_preset
 from neuroslam.errors import RunError, SourceError
+from neuroslam.plotting import render
 from neuroslam.sensors import open_source
 from neuroslam.tuning import tune
+from neuroslam.tuning.drawing import plot_tuning
 from neuroslam.tuning.drive import key_frames, read_drive
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG, Shifts, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits
@@ -140,6 +143,34 @@ def test_the_map_gets_better_and_the_config_is_one_that_run_takes(tuned, tmp_pat
     assert (out / "tune.png").stat().st_size > 20_000
     arguments = ["run", PICTURES, "--config", str(out / "config.toml"), "--no-tensorboard"]
     assert main([*arguments, "--stop", "40", "-o", str(tmp_path / "run")]) == 0
+
+
+def test_the_map_found_is_turned_onto_the_map_before_and_figures_are_written_out(tuned):
+    tuning, _ = tuned
+    onto = tuning.before.track_xy
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    found = replace(tuning, after=tuning.after._replace(track_xy=1.5 * onto @ turn))
+    figure = plot_tuning(found, "drive.avi")
+    _, templates, _, maps, before, after = figure.get_axes()
+    tracks = [axes.get_lines()[0].get_xydata() for axes in (before, after)]
+    np.testing.assert_allclose(tracks[1], 1.5 * tracks[0], atol=1e-9)
+    assert after.get_xlabel() == "x (arbitrary unit), turned onto the map before"
+    scores = {f"{score.average_precision:.3f}" for score in tuning.views}
+    assert {text.get_text() for text in templates.texts} <= scores
+    render(figure)
+    ticks = [text.get_text() for text in maps.get_yticklabels()]
+    assert len(ticks) > 1
+    assert all(re.fullmatch(r"[\d.]+", tick) for tick in ticks)
+
+
+def test_where_nothing_was_revisited_empty_panels_have_no_axes(tuned):
+    tuning, _ = tuned
+    none = tuning.revisits._replace(same=np.empty((0, 2), np.int64))
+    figure = plot_tuning(replace(tuning, revisits=none, motion=None, trials=[]), "drive.avi")
+    for panel in (1, 2, 3):
+        axes = figure.get_axes()[panel]
+        assert (len(axes.get_xticks()), len(axes.get_yticks())) == (0, 0)
+        assert len(axes.texts) == 1
 
 
 def test_the_field_of_view_of_a_rendered_camera_is_found():

@@ -266,6 +266,17 @@ class NavigationCells(Population):
         self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
         return True
 
+    def remembered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what one animal knows: places ``(n, 2)``, links ``(m, 2)``, walls ``(w, 2)``.
+
+        A stretch of wall is where the perpendicular from where it was seen meets it.
+        """
+        centres, links = (part.numpy(force=True) for part in self.place.graph())
+        columns = self.walls.remembered()[0][:4]
+        x, y, bearing, distance = (column.numpy(force=True) for column in columns)
+        feet = np.column_stack([x + distance * np.cos(bearing), y + distance * np.sin(bearing)])
+        return centres, links, feet
+
     @property
     def variance_m2(self) -> float:
         """How sure one animal is of its position: the mean variance of x and y."""

@@ -142,7 +142,7 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
 def truth_on_map(
     track: np.ndarray, truth: np.ndarray | None
 ) -> tuple[np.ndarray | None, float | None]:
-    """Lay the true track over the map, as ``map.png`` lays the map over the truth.
+    """Lay the true track over the map, as ``map.png`` does.
 
     Returns:
         Positions ``(frames, 2)`` in metres of the map, and metres of the truth in one of them;

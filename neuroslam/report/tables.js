@@ -138,7 +138,7 @@ function showLegend() {
   if (layers.loops.on) add("key-line", colour(colours.loop), "loop closures");
   if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
   if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
-  if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, the map scaled by ${about.truth_scale.toFixed(2)}`);
+  if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, scaled by ${(1 / about.truth_scale).toFixed(2)}`);
   if (layers.merges.on) add("key-ring", colour(colours.match), "maps joined here");
   if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "walls as remembered");
   if (layers.landmarks.on) add("key-dot", { background: colours.landmark }, "landmarks");

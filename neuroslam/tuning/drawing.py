@@ -7,9 +7,22 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, OTHER, STYLE, new_figure, write_title
-from neuroslam.errors import counted
+from neuroslam.drawing import (
+    INK,
+    LOOP,
+    MAP,
+    ODOMETRY,
+    OTHER,
+    STYLE,
+    new_figure,
+    plain_text,
+    write_decimals,
+    write_title,
+)
+from neuroslam.errors import MapError, counted
+from neuroslam.evaluation.trajectory import align
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG
 
 if TYPE_CHECKING:
@@ -22,15 +35,19 @@ def plot_tuning(tuning: "Tuning", name: str) -> Figure:
     n, found = len(tuning.keys), len(tuning.revisits.same)
     title = f"{Path(name).name}: {100 * found / n:.0f} % of {n} key frames show a place seen twice"
     with mpl.rc_context(STYLE):
-        figure = new_figure(13.0, 8.0, title.replace("$", r"\$"))
+        figure = new_figure(13.0, 8.0, plain_text(title))
         axes = figure.subplots(2, 3)
         _draw_differences(axes[0, 0], tuning)
         _draw_templates(axes[0, 1], tuning)
         _draw_field_of_view(axes[0, 2], tuning)
         _draw_maps(axes[1, 0], tuning)
-        unit = "m, not to scale" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
-        _draw_track(axes[1, 1], tuning.before, "Before", unit)
-        _draw_track(axes[1, 2], tuning.after, "Found", unit)
+        unit = "arbitrary unit" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
+        before, after = tuning.before, tuning.after
+        turned = _turned(after.track_xy, before.track_xy)
+        _draw_track(axes[1, 1], before, before.track_xy, "Before", unit)
+        _draw_track(axes[1, 2], after, turned, "Found", unit)
+        if turned is not after.track_xy:
+            axes[1, 2].set_xlabel(f"x ({unit}), turned onto the map before")
     return figure
 
 
@@ -46,17 +63,19 @@ def _draw_differences(axes: Axes, tuning: "Tuning") -> None:
             axes.hist(values, bins, weights=weights, histtype="step", lw=1.6, color=colour,
                       label=label)  # fmt: skip
     axes.axvline(threshold, color=INK, ls="--", lw=1.0, label=f"threshold {threshold:g}")
+    axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.set(title="How different two views are", xlabel="mean difference of templates (0 to 1)",
              ylabel="pairs (%)", xlim=(0.0, top))  # fmt: skip
     axes.legend()
 
 
 def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
-    axes.set(title="Templates: telling places apart", xlabel="average precision", xlim=(0.0, 1.0))
+    axes.set_title("Templates: telling places apart")
     if not len(tuning.revisits.same):
-        axes.set_yticks([])
-        axes.text(0.5, 0.5, "no place was seen twice", transform=axes.transAxes, ha="center")
+        _say_none(axes, "no place was seen twice")
         return
+    axes.set(xlabel="average precision", xlim=(0.0, 1.15))
+    axes.set_xticks(np.linspace(0.0, 1.0, 6))
     seen: dict[str, float] = {}
     for score in tuning.views:
         config = score.config
@@ -67,19 +86,20 @@ def _draw_templates(axes: Axes, tuning: "Tuning") -> None:
         seen.setdefault(label, score.average_precision)
     chosen = next(iter(seen))
     ordered = sorted(seen.items(), key=lambda item: item[1])
-    axes.barh([label for label, _ in ordered], [value for _, value in ordered], height=0.7,
-              color=[MAP if label == chosen else "#b9cfe0" for label, _ in ordered])  # fmt: skip
+    colours = [MAP if label == chosen else "#b9cfe0" for label, _ in ordered]
+    bars = axes.barh(*zip(*ordered, strict=True), height=0.7, color=colours)
+    axes.bar_label(bars, fmt="%.3f", padding=2, fontsize=7)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", labelsize=7)
 
 
 def _draw_field_of_view(axes: Axes, tuning: "Tuning") -> None:
-    axes.set(title="Field of view: do loops close?", xlabel="horizontal field of view (°)",
-             ylabel="error of the turns of loops, 1 - cos")  # fmt: skip
+    axes.set_title("Field of view: do loops close?")
     motion = tuning.motion
     if motion is None:
-        axes.text(0.5, 0.5, "not told by this drive", transform=axes.transAxes, ha="center")
+        _say_none(axes, "not told by this drive")
         return
+    axes.set(xlabel="horizontal field of view (°)", ylabel="error of the turns of loops, 1 - cos")
     axes.plot(FIELDS_OF_VIEW_DEG, motion.error, color=MAP)
     axes.axvline(motion.fov_deg, color=INK, ls="--", lw=1.0, label=f"{motion.fov_deg:.0f}°")
     axes.set_ylim(bottom=0.0)
@@ -87,11 +107,11 @@ def _draw_field_of_view(axes: Axes, tuning: "Tuning") -> None:
 
 
 def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
-    axes.set(title="Maps: inconsistency", xlabel="threshold of the views",
-             ylabel="distance of revisits / of other pairs")  # fmt: skip
+    axes.set_title("Maps: inconsistency")
     if not tuning.trials:
-        axes.text(0.5, 0.5, "no place was seen twice", transform=axes.transAxes, ha="center")
+        _say_none(axes, "no place was seen twice")
         return
+    axes.set(xlabel="threshold of the views", ylabel="distance of revisits / of other pairs")
     energies = sorted({trial.config.pose_cells.inject_energy for trial in tuning.trials})
     for energy, colour in zip(energies, (OTHER, MAP, LOOP, ODOMETRY), strict=False):
         some = [t for t in tuning.trials if t.config.pose_cells.inject_energy == energy]
@@ -99,16 +119,30 @@ def _draw_maps(axes: Axes, tuning: "Tuning") -> None:
                   ".-", color=colour, label=f"injection {energy:g}")  # fmt: skip
     axes.axvline(tuning.config.view.threshold, color=INK, ls="--", lw=1.0, label="chosen")
     axes.set_yscale("log")
+    write_decimals(axes.yaxis)
     axes.legend()
 
 
-def _draw_track(axes: Axes, trial: "Trial", title: str, unit: str) -> None:
+def _say_none(axes: Axes, why: str) -> None:
+    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center")
+    axes.set(xticks=[], yticks=[])
+
+
+def _turned(track_xy: np.ndarray, onto_xy: np.ndarray) -> np.ndarray:
+    """Turn a track about its start as it lies best on another of the same frames, if it can be."""
+    try:
+        return track_xy @ align(track_xy, onto_xy, "rigid").rotation.T
+    except MapError:  # of other frames, or of a robot that stood still
+        return track_xy
+
+
+def _draw_track(axes: Axes, trial: "Trial", track_xy: np.ndarray, title: str, unit: str) -> None:
     off = trial.inconsistency
     told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
     write_title(axes, title, f"{counted(trial.n_places, 'place')}{told}")
-    axes.plot(*trial.track_xy.T, color=MAP, lw=0.6)
-    axes.plot(*trial.track_xy[0], "o", color=OTHER, ms=5, label="start")
-    axes.plot(*trial.track_xy[-1], "s", color=INK, ms=4, label="end")
+    axes.plot(*track_xy.T, color=MAP, lw=0.6)
+    axes.plot(*track_xy[0], "o", color=OTHER, ms=5, label="start")
+    axes.plot(*track_xy[-1], "s", color=INK, ms=4, label="end")
     axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend()
