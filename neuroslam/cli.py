@@ -402,7 +402,7 @@ def inspect_command(path: MapFile) -> int:
     """Say what is in a map."""
     from neuroslam.inspection import inspect
 
-    table = Table(title=str(path), show_header=False)
+    table = _table("what", "is", title=str(path), headed=False)
     for name, value in inspect(path):
         table.add_row(name, value)
     console.print(table)
@@ -562,9 +562,10 @@ def _name_and_file(text: str) -> tuple[str, Path]:
     return name, Path(file)
 
 
-def _table(*names: str, title: str | None = None) -> Table:
+def _table(*names: str, title: str | None = None, headed: bool = True) -> Table:
     """Make a table whose words are never cut: a name that is told is one to be copied."""
-    return Table(*(Column(name, overflow="fold") for name in names), title=title)
+    columns = (Column(name, overflow="fold") for name in names)
+    return Table(*columns, title=title, show_header=headed)
 
 
 def _down(rows: list[dict[str, Any]], title: str) -> Table:
