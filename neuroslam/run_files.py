@@ -417,6 +417,12 @@ def read_plan(out: str | Path) -> RunPlan:
     """
     refuse_many(Path(out))
     path = Path(out) / "config.toml"
+    if (Path(out) / "frames.csv").exists() and not any(
+        (Path(out) / name).exists() for name in RUN_FILES[4:]
+    ):
+        raise RunError(
+            f"{out}: was cut off before anything was saved; run it again with --overwrite"
+        )
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
         return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
@@ -425,10 +431,6 @@ def read_plan(out: str | Path) -> RunPlan:
             raise RunError(
                 f"{path}: is missing, and says what the run reads; put it back. The map is in "
                 f"{Path(out) / 'brain.safetensors'}, which can be used alone"
-            ) from None
-        if (Path(out) / "frames.csv").exists():
-            raise RunError(
-                f"{out}: was cut off before anything was saved; run it again with --overwrite"
             ) from None
         raise RunError(f"{out}: not a run, it has no config.toml") from None
     except (KeyError, TypeError, ValueError):  # not TOML, not text, or not of a run

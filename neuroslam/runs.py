@@ -138,7 +138,7 @@ def resolve_config(
         values = merge_values(values, parse_assignment(text))
     if assignments:
         origin = option if not config else f"{origin} with {option}"
-    return build_config(values, origin)
+    return _located(build_config(values, origin))
 
 
 def run(
@@ -196,7 +196,7 @@ def run(
     if any(Path(path).parent == out.resolve() for path in paths):
         raise RunError(f"{out}: holds the stored map, which would be lost; take another folder")
     stored = [load_brain(path) for path in paths]  # first: nothing is written if it fails
-    config = config or (stored[0].config if stored else BrainConfig())
+    config = _located(config or (stored[0].config if stored else BrainConfig()))
     opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(
@@ -299,7 +299,13 @@ def _drive(
     asked: list[int],
     keep: Callable[[], None],
 ) -> None:
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter() - summary.seconds  # a resumed run goes on counting
+    cpu = time.process_time() - summary.cpu_seconds
+
+    def note_time() -> None:
+        summary.seconds = time.perf_counter() - wall
+        summary.cpu_seconds = time.process_time() - cpu
+
     try:
         with contextlib.closing(recorder):
             for frame, result in steps:
@@ -308,6 +314,7 @@ def _drive(
                 summary.added += 1
                 if on_step is not None:
                     on_step(result)
+                note_time()
                 keep()
                 if asked:
                     break
@@ -316,8 +323,7 @@ def _drive(
     summary.interrupted = bool(asked)
     # A resumed run meets again the bad frames after its last good one: they count once.
     summary.skipped = list(dict.fromkeys(summary.skipped))
-    summary.seconds += time.perf_counter() - wall
-    summary.cpu_seconds += time.process_time() - cpu
+    note_time()
 
 
 def _keeper(
@@ -444,6 +450,14 @@ def write_results(
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary
+
+
+def _located(config: BrainConfig) -> BrainConfig:
+    """Say where a network's weights lie from anywhere: a run may be resumed in another folder."""
+    if config.view.weights is None:
+        return config
+    view = config.view.model_copy(update={"weights": str(Path(config.view.weights).resolve())})
+    return config.model_copy(update={"view": view})
 
 
 def _absolute(source: str | Path) -> str:

@@ -15,6 +15,7 @@ from neuroslam.brain.matching import find_match
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.experiments import run_experiment
+from neuroslam.sections import SessionConfig
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
 from neuroslam.view import LocalViewCells
@@ -262,6 +263,80 @@ def test_a_session_joins_the_map_of_its_network_and_keeps_the_network(first, tou
     assert (brain.view.n, len(brain.stored)) == (1, 1)
 
 
+def test_after_a_gap_the_network_makes_the_views_of_a_new_map(tour):
+    """The first frame of a new map was looked at before that was begun."""
+    config = config_of().model_copy(update={"sessions": SessionConfig(after_gap="new_map")})
+    brain = NavigationBrain(config, features=filters())
+    for frame in tour[:40]:
+        brain(frame)
+    later = [f._replace(time_s=f.time_s + 600.0) for f in tour[40:80]]
+    for frame in later:
+        brain(frame)
+    assert len(brain.stored) == 1
+    assert brain.view.n > 1
+    assert brain.view.network_digest == brain.stored[0].view.network_digest != 0
+
+
+def test_networks_without_weights_are_told_apart_by_their_parts():
+    pooled = [FeatureEncoder(ViewConfig(**SMALL), nn.AvgPool2d(size)).digest for size in (4, 8, 4)]
+    assert pooled[0] == pooled[2] != pooled[1]
+
+
+@pytest.mark.parametrize("precision", [torch.float16, torch.bfloat16, torch.float64])
+def test_weights_may_be_kept_in_another_precision(precision, squeezenet, tmp_path):
+    state = torch.load(squeezenet / "squeezenet.pth", weights_only=True)
+    torch.save({name: w.to(precision) for name, w in state.items()}, tmp_path / "other.pth")
+    x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    plain, other = (
+        load_network("squeezenet1_1.features.4", path)(x)
+        for path in (squeezenet / "squeezenet.pth", tmp_path / "other.pth")
+    )
+    assert other.dtype == torch.float32
+    assert float((plain - other).detach().abs().max()) < 0.02 * float(plain.detach().abs().max())
+    encoded = FeatureEncoder(ViewConfig(**SMALL), filters().to(precision))(texture())
+    assert encoded.template.shape == (32, 16)
+
+
+def weights_of(name, folder):
+    """Write weights of a network of torchvision that were drawn and not learnt."""
+    vision.load()
+    from torchvision import models
+
+    with torch.random.fork_rng():
+        torch.save(models.get_model(name).state_dict(), folder / f"{name}.pth")
+    return folder / f"{name}.pth"
+
+
+def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(tmp_path):
+    path = weights_of("swin_t", tmp_path)
+    assert load_network("swin_t", path)(torch.rand(1, 3, 96, 192)).shape == (1, 768, 7, 14)
+    with pytest.raises(ConfigError, match=r"channels last; name swin_t\.permute"):
+        load_network("swin_t.features", path)
+
+
+def test_a_network_that_reckons_with_tensors_can_be_made(tmp_path):
+    path = weights_of("regnet_y_400mf", tmp_path)
+    assert load_network("regnet_y_400mf.trunk_output", path)(torch.rand(1, 3, 64, 64)).ndim == 4
+
+
+class Transformer(nn.Module):
+    """Takes one size, as transformers do."""
+
+    def forward(self, x):
+        assert x.shape[-1] == 224, "Wrong image width!"
+        return x
+
+
+def test_a_network_that_only_takes_its_own_size_is_one_line():
+    with pytest.raises(ConfigError, match=r"fails on a picture of 96x64 px \(Wrong image width!"):
+        FeatureEncoder(ViewConfig(**SMALL), Transformer())(texture())
+
+
+def test_a_name_is_no_network():
+    with pytest.raises(ConfigError, match=r"expected a torch\.nn\.Module"):
+        NavigationBrain(config_of(), features="resnet18")
+
+
 def test_maps_of_two_networks_are_not_merged(first, tour):
     other = lived(tour[:60], filters(seed=1))
     assert "the weights of 'module', by which views were made" in find_match(first, other).reason
@@ -280,15 +355,22 @@ def test_where_the_weights_lie_does_not_matter(squeezenet):
     assert "config" not in find_match(*brains).reason
 
 
-def test_a_run_with_a_network(call, mistake, squeezenet, tmp_path):
+def test_a_run_with_a_network(call, mistake, squeezenet, tmp_path, monkeypatch):
     given = ["--set", "view.features=squeezenet1_1.features.4", "--set", "view.shift_match=0"]
     weights = ["--set", f"view.weights={squeezenet / 'squeezenet.pth'}"]
     out = tmp_path / "run"
     assert call("run", WORLD, "--out", out, "--stop", 40, *given, *weights).code == 0
     assert load_brain(out / "brain.safetensors").view.n > 3
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(squeezenet)
+    near = ["--set", "view.weights=squeezenet.pth"]
+    assert call("run", WORLD, "--out", tmp_path / "near", "--stop", 9, *given, *near).code == 0
+    monkeypatch.chdir(elsewhere)  # the weights are where they were
+    assert call("resume", tmp_path / "near", "--stop", 12).code == 0
     missing = ["--set", "view.weights=none.pth"]
     said = mistake("run", WORLD, "--out", tmp_path / "other", *given, *missing)
-    assert "view.weights = 'none.pth': no such file" in said
+    assert f"view.weights = '{elsewhere / 'none.pth'}': no such file" in said
 
 
 def test_networks_are_compared_on_the_corridor(shared, squeezenet, tmp_path, mistake):

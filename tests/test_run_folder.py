@@ -181,6 +181,7 @@ def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_file
     told = json.loads((out / "metrics.json").read_text())
     assert told["interrupted"]
     assert told["frames"] > 0
+    assert told["seconds"] > 0.0  # it is resumed with the time that it took so far
     assert (out / "brain.safetensors").is_file()
     stop = 30 + len(read_trace(out)["time_s"])
     for command in ("plot", "inspect", "report"):  # what was saved can be looked at
@@ -195,6 +196,13 @@ def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_file
         assert (out / name).read_bytes() == (tmp_path / "uncut" / name).read_bytes(), name
     assert not json.loads((out / "metrics.json").read_text())["interrupted"]
     assert not list(out.glob(".*"))
+
+
+def test_a_run_that_was_killed_in_its_first_save_says_so(copy, says):
+    for name in RUN_FILES[4:]:
+        (copy / name).unlink()
+    said = f"{copy}: was cut off before anything was saved; run it again with --overwrite\n"
+    assert says("resume", copy) == (2, "", f"neuroslam resume: {said}")
 
 
 def test_a_run_that_was_killed_before_it_saved_says_so(tmp_path, says):

@@ -351,6 +351,7 @@ class NavigationBrain(nn.Module):
         self.stored.append(kept)
         self._begin()
         self.odometry, self.continuity = senses
+        self.view.go_on_from(kept.view)
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)
         self.recognition.store()

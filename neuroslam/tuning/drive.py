@@ -101,7 +101,11 @@ def read_drive(
         if (frame.image.shape[1], frame.image.shape[0]) != size:
             continue
         if encoder is not None:
-            view = encoder(frame.image)
+            try:
+                view = encoder(frame.image)
+            except BadFrame as fault:
+                faults.append(fault)
+                continue
             views[frame.index] = view._replace(template=to_bytes(view.template))
         frames.append(frame._replace(image=_smaller(frame.image, factor)))
         if len(frames) == MAX_FRAMES:

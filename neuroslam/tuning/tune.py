@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from neuroslam.config import BrainConfig, to_toml
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, counted
 from neuroslam.parallel import one_thread
 from neuroslam.plotting import save
 from neuroslam.run_files import write_text
@@ -74,7 +74,8 @@ class Tuning:
         if old is None or new is None or not new.inconsistency >= 0.0:  # NaN: not known
             return "not known to be better: the drive does not tell"
         fewer = old.n_places - new.n_places
-        size = f"{abs(fewer)} places {'fewer' if fewer > 0 else 'more'}" if fewer else "as large"
+        more = "fewer" if fewer > 0 else "more"
+        size = f"{counted(abs(fewer), 'place')} {more}" if fewer else "as large"
         if new.inconsistency > level_with(old.inconsistency):
             return f"less consistent than before, {size}: keep what you had"
         if old.inconsistency <= level_with(new.inconsistency):

@@ -3,9 +3,12 @@
 import difflib
 import hashlib
 import importlib
+import re
+import warnings
 from collections.abc import Callable
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -90,9 +93,10 @@ class FeatureEncoder:
 
     @cached_property
     def digest(self) -> int:
-        """A number that tells networks apart by their weights, never 0."""
-        told = tensors_digest(self.network.state_dict()) + type(self.network).__name__
-        told += self.config.features
+        """A number that tells networks apart by their weights and parts, never 0."""
+        told = tensors_digest(self.network.state_dict()) + self.config.features
+        if self._passed is not None:  # what has no weights tells networks apart too
+            told += re.sub(r" at 0x[0-9a-f]+", "", repr(self._passed))
         return int.from_bytes(hashlib.sha256(told.encode()).digest()[:7]) + 1
 
     def __call__(self, image: np.ndarray) -> Encoded:
@@ -127,11 +131,11 @@ class FeatureEncoder:
 
     def _features(self, x: Tensor) -> Tensor:
         config, name = self.config, self.config.features
-        where = next(self.network.parameters(), x).device
+        weights = (w for w in self.network.parameters() if w.is_floating_point())
         try:
             with torch.inference_mode():
-                found = self.network(x.to(where))
-        except (RuntimeError, ValueError, TypeError) as error:
+                found = self.network(x.to(next(weights, x)))  # to their device and precision
+        except (RuntimeError, ValueError, TypeError, AssertionError, LookupError) as error:
             raise ConfigError(
                 f"view.features = {name!r}: the network fails on a picture of "
                 f"{x.shape[-1]}x{x.shape[-2]} px ({first_line(error)})"
@@ -168,6 +172,11 @@ def view_encoder(config: ViewConfig, features: nn.Module | Encoder | None = None
         (10, 60)
     """
     if features is not None and not isinstance(features, nn.Module):
+        if not callable(features):
+            raise ConfigError(
+                f"features is {features!r}; expected a torch.nn.Module. One of torchvision is "
+                "named in the config, as view.features"
+            )
         return features
     if config.features == "grey" and features is None:
         return partial(encode, config=config)
@@ -209,7 +218,8 @@ def features_as_template(features: Tensor, height: int, width: int, around: int 
 @lru_cache(maxsize=4)
 def _directions(n: int, n_features: int) -> Tensor:
     """The same in every brain: they belong to the code, and not to its state."""
-    return torch.randn(n, n_features, generator=torch.Generator().manual_seed(0))
+    draw = torch.Generator().manual_seed(0)
+    return torch.randn(n, n_features, generator=draw, dtype=torch.float32)
 
 
 def load_network(name: str, weights: str | Path | None) -> nn.Module:
@@ -237,8 +247,7 @@ def load_network(name: str, weights: str | Path | None) -> nn.Module:
             f"view.features = {name!r}: expected 'grey', 'module', or a network of torchvision and "
             f"its layer, as 'resnet18.layer3'; near it are {near}"
         )
-    with torch.device("meta"):  # no weights are drawn that are replaced at once
-        network = models.get_model(model_name, weights=None)
+    network = _empty(models, model_name)
     state = _read_weights(weights)
     try:
         network.load_state_dict(state, assign=True)
@@ -247,10 +256,18 @@ def load_network(name: str, weights: str | Path | None) -> nn.Module:
         why = f"{len(missing)} tensors of it are missing" if missing else first_line(error)
         raise ConfigError(f"view.weights = {str(weights)!r}: not of {model_name} ({why})") from None
     parts = [part for part, _ in network.named_children()]
-    layer = layer or next((part for part in ("features", "layer4") if part in parts), "")
+    last = ("permute", "features", "layer4")
+    layer = layer or next((part for part in last if part in parts), "")
+    if "permute" in parts and layer.partition(".")[0] == "features":
+        raise ConfigError(
+            f"view.features = {name!r}: has its channels last; name {model_name}.permute, behind it"
+        )
     try:
-        upto = extraction.create_feature_extractor(network.eval(), {layer: "found"})
-    except (ValueError, RuntimeError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that training and evaluation differ in their nodes
+            network = network.float().eval()  # a file may hold halves
+            upto = extraction.create_feature_extractor(network, {layer: "found"})
+    except (ValueError, RuntimeError, AssertionError):
         raise ConfigError(
             f"view.features = {name!r}: expected a layer of {model_name} behind its name; its "
             f"parts are {', '.join(parts)}"
@@ -260,6 +277,18 @@ def load_network(name: str, weights: str | Path | None) -> nn.Module:
         vision.transforms.Normalize(_MEAN, _STD),
     ]
     return nn.Sequential(*prepare, upto, _Found())
+
+
+def _empty(models: ModuleType, name: str) -> nn.Module:
+    """Make a network whose weights are to be replaced at once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of how weights would be drawn
+        try:
+            with torch.device("meta"):  # then none are
+                return models.get_model(name, weights=None)
+        except NotImplementedError:  # RegNet reckons its widths with tensors
+            with torch.random.fork_rng(devices=[]):
+                return models.get_model(name, weights=None)
 
 
 class _Found(nn.Module):

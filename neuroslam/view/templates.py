@@ -92,6 +92,11 @@ class LocalViewCells(Population):
         """
         return self._encode(image).template
 
+    def go_on_from(self, before: "LocalViewCells") -> None:
+        """Make templates by the network of other cells: a frame may have been looked at already."""
+        if self.config.features != "grey":
+            self.network.digest = before.network_digest
+
     def load_network(self) -> None:
         """Load the network that makes templates, where there is one; it must be the map's.
 
