@@ -15,7 +15,7 @@ from torch import nn
 from neuroslam.brain import NavigationBrain
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, build_config, read_config_file, read_preset
-from neuroslam.errors import RunError, SourceError
+from neuroslam.errors import BadFrame, RunError, SourceError
 from neuroslam.plotting import render
 from neuroslam.sensors import open_source
 from neuroslam.tuning import tune
@@ -24,6 +24,7 @@ from neuroslam.tuning.drive import key_frames, read_drive
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG, Shifts, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits
 from neuroslam.tuning.search import Trial, best_of, judge
+from neuroslam.view.preprocess import Encoded
 
 SMALL = "world:ellipse?laps=1.4&width=64&height=32&rate=10"
 PICTURES = SMALL + "&odometry=false"
@@ -49,6 +50,19 @@ def test_what_is_seen_twice_is_what_lies_one_lap_apart(driven):
     assert np.quantile(apart, 0.99) < 0.5  # of an ellipse of many metres
     others = np.linalg.norm(truth[revisits.other[:, 0]] - truth[revisits.other[:, 1]], axis=1)
     assert np.median(others) > 5.0
+
+
+def test_a_picture_that_a_network_cannot_use_is_left_out(driven):
+    seen = []
+
+    def encoder(picture):
+        seen.append(picture)
+        if len(seen) == 50:
+            raise BadFrame("features are not all finite numbers")
+        return Encoded(np.zeros((4, 8)), 1.0)
+
+    drive = read_drive(open_source(SMALL), encoder=encoder)
+    assert (len(drive.frames), drive.unusable) == (len(driven.frames) - 1, 1)
 
 
 def test_standing_still_gives_no_key_frames(driven):
