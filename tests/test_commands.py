@@ -20,7 +20,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 WORLD = "world:corridor?frames_per_lap=110&laps=1.4&width=160&height=120&grey=true"
 SESSIONS = ("drive", "monday", "tuesday", "wednesday", "friday")
 SHORT = {"world:": "40", "arena:": "4000"}
-"""Rendered worlds and arenas run for so many frames, for the sake of time; no other word differs."""
+"""Rendered worlds and arenas run for so many frames only, for the sake of time."""
 
 
 def commands(page: Path) -> list[str]:
