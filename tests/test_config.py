@@ -19,7 +19,7 @@ from neuroslam.config import (
     to_toml,
 )
 from neuroslam.errors import ConfigError
-from neuroslam.runs import resolve_config
+from neuroslam.runs.run import resolve_config
 
 
 @pytest.mark.parametrize("name", preset_names())

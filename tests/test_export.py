@@ -11,9 +11,9 @@ from neuroslam.brain.sessions import session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError, ConfigError, RunError, SourceError
 from neuroslam.evaluation.trajectory import read_tum
-from neuroslam.export import export
 from neuroslam.geometry import compose, wrap_angles
-from neuroslam.runs import run
+from neuroslam.runs.export import export
+from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
 from neuroslam.types import Pose
 

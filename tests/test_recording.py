@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import RunError
-from neuroslam.recording import (
+from neuroslam.runs.recording import (
     NullRecorder,
     TensorBoardRecorder,
     activity_picture,

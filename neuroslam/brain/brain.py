@@ -24,12 +24,12 @@ from neuroslam.geometry import TWO_PI, compose, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
 from neuroslam.odometry.visual import VisualOdometry
-from neuroslam.population import Population, Running, State
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.spiking.sightings import VIEW, Guide, Sightings, Told
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Population, Running, State
+from neuroslam.state.tables import Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,

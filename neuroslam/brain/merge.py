@@ -16,8 +16,8 @@ from neuroslam.errors import MapError, counted
 from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.joining import links_kept
 from neuroslam.mapping.overlap import Pairs
-from neuroslam.population import Join, Population, State
 from neuroslam.spiking.landmark_frames import shared_frames
+from neuroslam.state.population import Join, Population, State
 from neuroslam.types import NO_TEMPLATE, Pose
 
 if TYPE_CHECKING:
@@ -316,7 +316,7 @@ def merge_states(
     """Merge two state dicts of brains into one; a pure function, neither is altered.
 
     The session that goes on is the partial one. Each population merges by its own rule,
-    :meth:`~neuroslam.population.Population.merged`; maps that both keep besides are kept.
+    :meth:`~neuroslam.state.population.Population.merged`; maps that both keep besides are kept.
 
     Args:
         loaded: ``state_dict`` of the brain that is merged into.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.population import Join, Population, State
+from neuroslam.state.population import Join, Population, State
 
 _ID_BITS = 40
 
