@@ -26,8 +26,8 @@ import numpy as np
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import MergeReport
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import MergeReport
 from neuroslam.evaluation.icp import fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.lives import Picture, bindings, live, measure, stage, track

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.sessions import session_name
+from neuroslam.state.sessions import session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError, ConfigError, RunError, SourceError
 from neuroslam.evaluation.trajectory import read_tum

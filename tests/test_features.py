@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
+from neuroslam.merging.match import find_match
 from neuroslam.config import ViewConfig
 from neuroslam.config.sections import SessionConfig
 from neuroslam.errors import BadFrame, ConfigError

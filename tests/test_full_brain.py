@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import Match, make_join, merge
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import Match, make_join, merge
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import BadFrame, MapError

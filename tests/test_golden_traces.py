@@ -21,11 +21,11 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import merge
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import merge
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.evaluation.trajectory import Track, write_tum
-from neuroslam.run_files import (
+from neuroslam.runs.files import (
     RowWriter,
     experiences_csv,
     landmarks_csv,

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from torch import nn
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import Match, differing_keys, make_join, merge, merge_states
-from neuroslam.brain.sessions import Session
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import Match, differing_keys, make_join, merge, merge_states
+from neuroslam.state.sessions import Session
 from neuroslam.cells.convolve import Packet
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles

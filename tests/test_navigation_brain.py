@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.wall_matching import Outline, lay_walls
+from neuroslam.cells.wall_matching import Outline, lay_walls
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.errors import BadFrame
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align

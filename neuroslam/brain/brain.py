@@ -10,11 +10,11 @@ import torch
 from torch import nn
 
 from neuroslam.brain.continuity import Continuity
-from neuroslam.brain.limits import WINDOW, elsewhere, tolerance
-from neuroslam.brain.matching import shared_history
-from neuroslam.brain.merge import Match, differing, merge
+from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
+from neuroslam.merging.match import shared_history
+from neuroslam.merging.merge import Match, differing, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
-from neuroslam.brain.sessions import Session, SessionLog, session_id
+from neuroslam.state.sessions import Session, SessionLog, session_id
 from neuroslam.cells.boundary import check_walls
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroslam.brain.matching import find_match
+from neuroslam.merging.match import find_match
 from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
 from neuroslam.evaluation.icp import map_rmse
 from neuroslam.evaluation.trajectory import align

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.brain.merge import MergeReport
+from neuroslam.merging.merge import MergeReport
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import align

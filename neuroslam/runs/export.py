@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
-from neuroslam.brain.sessions import session_name
+from neuroslam.state.sessions import session_name
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file, track_file

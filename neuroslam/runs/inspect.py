@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint
-from neuroslam.brain.sessions import Session, session_name
+from neuroslam.state.sessions import Session, session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import NeuroslamError, counted
 from neuroslam.evaluation.trajectory import read_tum

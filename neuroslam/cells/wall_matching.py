@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuroslam.brain.merge import Match
+from neuroslam.merging.merge import Match
 from neuroslam.errors import counted
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.overlap import Pairs

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.brain.limits import far_off, tolerance
+from neuroslam.merging.limits import far_off, tolerance
 from neuroslam.cells.attractor import moved_cells
 from neuroslam.cells.joining import view_frames
 from neuroslam.config import BrainConfig

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from neuroslam.brain.landmark_matching import match_landmarks
-from neuroslam.brain.limits import elsewhere, far_off, tolerance
-from neuroslam.brain.merge import Match, differing
-from neuroslam.brain.sessions import session_name
-from neuroslam.brain.wall_matching import match_walls
+from neuroslam.spiking.landmark_matching import match_landmarks
+from neuroslam.merging.limits import elsewhere, far_off, tolerance
+from neuroslam.merging.merge import Match, differing
+from neuroslam.state.sessions import session_name
+from neuroslam.cells.wall_matching import match_walls
 from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neuroslam.brain.merge import Match
+from neuroslam.merging.merge import Match
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.spiking.landmark_frames import shared_frames
