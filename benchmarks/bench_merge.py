@@ -7,11 +7,12 @@ import torch
 from benchmarks.bench_relaxation import laps
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.brain import NavigationBrain
-from neuroslam.merging.merge import Match, merge
+from neuroslam.merging.merge import merge
+from neuroslam.state.match import Match
 from neuroslam.brain.recognition import StoredViews
 from neuroslam.state.sessions import Session
 from neuroslam.config import BrainConfig
-from neuroslam.mapping.overlap import Pairs
+from neuroslam.state.match import Pairs
 from neuroslam.view.search import block_means
 
 SIZES = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)

@@ -57,3 +57,19 @@ class RunError(NeuroslamError, ValueError):
 
 class SpaceError(NeuroslamError, ValueError):
     """Vectors or positions that do not fit a semantic map: wrong dimension, NaN, unknown name."""
+
+
+_SHOWN = 5
+
+
+def listed(values: Iterable[float]) -> str:
+    """Write the first five of many values, and how many more there are.
+
+    Example:
+        >>> listed(range(7))
+        '0, 1, 2, 3, 4 and 2 more'
+    """
+    rows = [value.item() if hasattr(value, "item") else value for value in values]
+    shown = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in rows[:_SHOWN])
+    more = len(rows) - _SHOWN
+    return f"{shown} and {more} more" if more > 0 else shown

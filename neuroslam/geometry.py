@@ -30,6 +30,17 @@ def wrap_angles(angles_rad: np.ndarray) -> np.ndarray:
     return (angles_rad + math.pi) % TWO_PI - math.pi
 
 
+def rotate(x: float, y: float, by_rad: float) -> tuple[float, float]:
+    """Turn a vector counter-clockwise.
+
+    Example:
+        >>> [round(value, 9) for value in rotate(1.0, 0.0, math.pi / 2)]
+        [0.0, 1.0]
+    """
+    c, s = math.cos(by_rad), math.sin(by_rad)
+    return c * x - s * y, s * x + c * y
+
+
 def compose(first: Pose, second: Pose) -> Pose:
     r"""Express ``second``, given in the frame of ``first``, in the world: :math:`p_1 \oplus p_2`.
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.state.sessions import session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError, ConfigError, RunError, SourceError
 from neuroslam.evaluation.trajectory import read_tum
@@ -15,6 +14,7 @@ from neuroslam.geometry import compose, wrap_angles
 from neuroslam.runs.export import export
 from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
+from neuroslam.state.sessions import session_name
 from neuroslam.types import Pose
 
 ELLIPSE = "world:ellipse?laps=2&width=256&height=64"

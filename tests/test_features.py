@@ -11,11 +11,11 @@ from safetensors.torch import save_file
 from torch import nn
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.merging.match import find_match
 from neuroslam.config import ViewConfig
 from neuroslam.config.sections import SessionConfig
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.experiments import run_experiment
+from neuroslam.merging.match import find_match
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
 from neuroslam.view import LocalViewCells, vision

@@ -7,16 +7,17 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import Match, make_join, merge
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import BadFrame, MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import make_join, merge
 from neuroslam.sensors import open_source
 from neuroslam.spiking.landmark_frames import shared_frames
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.spiking.sightings import Guide, Sightings
+from neuroslam.state.match import Match
 from neuroslam.types import Frame, Motion, Pose, Velocity
 
 SETS = [

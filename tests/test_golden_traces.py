@@ -21,14 +21,12 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import merge
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.evaluation.trajectory import Track, write_tum
+from neuroslam.merging.match import find_match
 from neuroslam.runs.files import (
     RowWriter,
     experiences_csv,
-    landmarks_csv,
     links_csv,
     read_trace,
     trajectory,
@@ -46,7 +44,8 @@ WORLD = (
     "&landmark_reach=6&frames_per_lap=150&outliers=0.05"
 )
 NOT_COMPARED = ("sessions.text", "clock.after_gap_s")
-"""Session ids follow from the whole config; the other is no longer part of a state."""
+"""Session ids follow from the whole config; the other is no longer part of a state, nor are pose
+cells of a brain that does not use them."""
 
 
 def arithmetic() -> str:
@@ -128,8 +127,8 @@ def drive(brain: NavigationBrain, frames: Iterable, out: Path) -> dict:
 
 def tables_of(brain: NavigationBrain) -> dict[str, str]:
     tables = {"experiences.csv": experiences_csv(brain), "links.csv": links_csv(brain.map.links)}
-    if "semantic" in brain.config.cells:
-        tables["landmarks.csv"] = landmarks_csv(brain)
+    for population in brain.populations.values():
+        tables |= population.tables()
     return tables
 
 
@@ -137,7 +136,8 @@ def state_digests(brain: NavigationBrain) -> dict[str, str]:
     """One digest a population: a difference is seen where it begins."""
     digests: dict[str, hashlib._Hash] = {}
     for name, tensor in sorted(brain.state_dict().items()):
-        if name.endswith(NOT_COMPARED) or name.endswith((".session", "session")):
+        unused = "pose_cells." in name and "pose" not in brain.config.cells
+        if unused or name.endswith((*NOT_COMPARED, "session")):
             continue
         part = digests.setdefault(f"state.{name.split('.')[0]}", hashlib.sha256())
         part.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
@@ -187,7 +187,7 @@ def a_life(cells: str, out: Path) -> dict:
 
 def merged(loaded: NavigationBrain, partial: NavigationBrain) -> dict:
     match = find_match(loaded, partial).match
-    both = None if match is None else merge(loaded, partial, match)[0]
+    both = None if match is None else loaded.merge(partial, match)[0]
     if both is None:
         return {"digests": {}, "figures": {"merged": 0}}
     tables = {n: hashlib.sha256(t.encode()).hexdigest() for n, t in tables_of(both).items()}

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from torch import nn
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import Match, differing_keys, make_join, merge, merge_states
-from neuroslam.state.sessions import Session
 from neuroslam.cells.convolve import Packet
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
-from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import differing_keys, make_join, merge, merge_states
 from neuroslam.runs.inspect import verify
 from neuroslam.sensors import open_source
+from neuroslam.state.match import Match, Pairs
 from neuroslam.state.population import Population
+from neuroslam.state.sessions import Session
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
 few = settings(max_examples=15, deadline=None)

@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from neuroslam import load_brain, run
-from neuroslam.merging.merge import MergeReport
 from neuroslam.cli import main
+from neuroslam.merging.merge import MergeReport
 from neuroslam.runs import review
 from neuroslam.runs.files import RUN_FILES, RunPlan, read_frames
 

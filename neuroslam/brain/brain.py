@@ -1,37 +1,35 @@
-"""The brain: odometry, view, pose cells and map, composed; one frame in, one result out."""
+"""The brain: odometry, views, a map and populations of cells; one frame in, one result out."""
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
-from typing import NamedTuple
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
+from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
-from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
-from neuroslam.merging.match import shared_history
-from neuroslam.merging.merge import Match, differing, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
-from neuroslam.state.sessions import Session, SessionLog, session_id
-from neuroslam.cells.boundary import check_walls
-from neuroslam.cells.navigation import NavigationCells
-from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, ConfigError, counted
-from neuroslam.geometry import TWO_PI, compose, wrap_angle
+from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
-from neuroslam.odometry.visual import VisualOdometry
-from neuroslam.sensors.markers import MarkerDetector
-from neuroslam.sensors.scan import walls_in_scan
-from neuroslam.spiking.semantic import SemanticCells
-from neuroslam.spiking.sightings import VIEW, Guide, Sightings, Told
-from neuroslam.state.population import Population, Running, State
+from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
+from neuroslam.merging.mapped import counts_of, differing
+from neuroslam.merging.match import shared_history
+from neuroslam.merging.merge import merge
+from neuroslam.merging.report import MergeReport
+from neuroslam.odometry.visual import Profiles, VisualOdometry
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import AboutNow, Mergeable, State
+from neuroslam.state.population import Correction, Decision, Population, StepInput, total
+from neuroslam.state.registry import leading_class, population_classes
+from neuroslam.state.sessions import Session, SessionLog, session_id
 from neuroslam.state.tables import Scalars
 from neuroslam.types import (
-    NO_EXPERIENCE,
     NO_TEMPLATE,
     Frame,
     Motion,
@@ -44,35 +42,49 @@ from neuroslam.types import (
 from neuroslam.view.features import Encoder, view_encoder
 from neuroslam.view.templates import LocalViewCells
 
-_COMPASS_S = 2.0  # over which the noise of a compass is averaged
 BLIND = ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
 
 
-class Clock(Scalars, Running):
+class Clock(Scalars, AboutNow):
     """Frame and time the brain is at."""
 
+    frame: int
+    time_s: float
+    frames_seen: int
 
-class Compass(Scalars, Running):
-    """Heading of the robot by compass and turns together, as the map has taken it over."""
 
+class Accepted(NamedTuple):
+    """A frame that the brain takes, and what was found in it; nothing has changed yet.
 
-class Sensed(NamedTuple):
-    """What a brain finds in a frame: the view, encoded; walls, ``(n, 2)``; landmarks."""
+    Attributes:
+        frame: As the source delivered it.
+        view: Its view, encoded; ``None``: it shows nothing.
+        observed: What each population found, by kind.
+        velocity: Measured, or by visual odometry.
+        dt_s: Time since the last frame.
+        profiles: For the visual odometry of the next frame; ``None``: it was not used.
+        gap: The time since the last frame is too long for the map to go on.
+    """
 
+    frame: Frame
     view: np.ndarray | None
-    walls: np.ndarray | None
-    landmarks: Sightings
+    observed: dict[str, Any]
+    velocity: Velocity
+    dt_s: float
+    profiles: Profiles | None
+    gap: bool
 
 
 class NavigationBrain(nn.Module):
-    """A stream of frames becomes a map of places, by any set of populations side by side.
+    """A stream of frames becomes a map of experiences, by any set of populations side by side.
 
-    Each stage is a module that can be used alone: ``odometry``, ``view``, ``pose_cells`` and
-    ``map`` (RatSLAM); ``navigation``, boundary, grid and place cells (SLRB), and ``semantic``,
-    landmarks and their places (SSP-SLAM), where ``config.cells`` names them. Where there are
-    several, they have one belief of where the robot is: self-motion and walls move it, landmarks
-    and views correct it, and each is told of what the others found. ``state_dict`` holds
-    everything: a brain that is saved, loaded and goes on is bit-equal to one that never stopped.
+    ``odometry``, ``view`` and ``map`` are modules that can be used alone; so are the populations
+    that ``config.cells`` names, each an attribute: ``pose_cells`` (RatSLAM), ``navigation``
+    (SLRB), ``semantic`` (SSP-SLAM), or your own. One of them leads: it decides about experiences.
+    All have one belief of where the robot is: self-motion and their own senses move it, memory
+    corrects it, and corrections are exchanged; see :mod:`neuroslam.state.population`.
+    ``state_dict`` holds everything: a brain that is saved, loaded and goes on is bit-equal to one
+    that never stopped.
 
     Args:
         config: Every parameter; the defaults suit a forward camera on a small robot.
@@ -95,7 +107,8 @@ class NavigationBrain(nn.Module):
         self._encoder = view_encoder(self.config.view, features)
         self.about = ("", "", "")  # source, preset and date of the next session
         self._detects = self.config.sessions.carried == "detect"
-        self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0, after_gap_s=-math.inf)
+        self._after_gap_s = -math.inf  # time of a frame that was refused for a gap before it
+        self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
         self.stored = nn.ModuleList()
         self._begin()
         self.register_load_state_dict_pre_hook(_make_stored)
@@ -106,97 +119,163 @@ class NavigationBrain(nn.Module):
         config, cells = self.config, self.config.pose_cells
         self.odometry = VisualOdometry(config.odometry)
         self.view = LocalViewCells(config.view, self._encoder)
-        self.pose_cells = PoseCellNetwork(cells)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
         )
-        if config.has("place"):
-            self.navigation = NavigationCells(config)
-        if config.has("semantic"):
-            heading = math.radians(config.map.initial_heading_deg)
-            follows = "map" if config.has("pose") else "cells" if config.has("place") else "nothing"
-            self.semantic = SemanticCells(config.semantic, heading, follows)
-        self.compass = Compass(heading_rad=0.0, known=0)
+        leader = leading_class(config)
+        for population in population_classes(config):
+            setattr(self, population.name, population.build(config, leader))
+        self.compass = Compass()
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
         self._changed()
 
     def _changed(self) -> None:
-        """Forget what follows from the stored maps."""
+        """Collect the populations anew, and forget what follows from the stored maps."""
         self._stored_views: StoredViews | None = None
+        classes = population_classes(self.config)
+        self._populations: dict[str, Population] = {
+            cls.kind: getattr(self, cls.name) for cls in classes
+        }
+        leader = leading_class(self.config)
+        self._leads = leader.kind
+        # A hook is called where a population has its own: most have few.
+        self._with = {
+            hook: [p for p in self._populations.values() if _overrides(type(p), hook)]
+            for hook in ("observe", "check", "step", "vetoes", "follow", "learn", "recall")
+        }
+        self._makes_views = any(cls.needs_views for cls in classes)
+        uses = {cls.compass for cls in classes}
+        self._has_compass = bool(uses - {"ignores"})
+        self._compass_turns_map = (
+            leader.relaxes_map and self._has_compass and "corrects" not in uses
+        )
 
+    @property
     def populations(self) -> dict[str, Population]:
-        """Return the parts that its state is made of, by name."""
-        return {n: part for n, part in self.named_children() if isinstance(part, Population)}
+        """The populations by kind, in the order in which they step."""
+        return self._populations
+
+    @property
+    def leader(self) -> Population:
+        """The population that decides about experiences."""
+        return self._populations[self._leads]
+
+    def parts(self) -> dict[str, Mergeable]:
+        """Return the parts that the state is made of, by name."""
+        return {name: p for name, p in self.named_children() if isinstance(p, Mergeable)}
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:
-        """Take in one frame.
+        """Advance by one frame.
 
         Raises:
-            BadFrame: If the frame's time does not follow the last one's, or it has nothing to
-                tell motion from. The brain knows no more then than before, and can go on with
-                another frame; after a gap the one after next is taken, if it follows.
+            BadFrame: If the frame's time does not follow the last one's, or it holds what cannot
+                be, or there is nothing to tell motion from. Nothing has changed then, and the brain
+                can go on with another frame; after a gap the one after next is taken, if it
+                follows.
+            MapError: If it would take the robot out of the space of a population; nothing has
+                changed then either.
         """
+        accepted = self._accept(frame)
+        now = self._enter(accepted)
+        observed, leader = accepted.observed, self.leader
+        made = [(p, p.step(now, observed[p.kind])) for p in self._with["step"]]
+        if self._compass_turns_map:
+            made.append((None, self.compass.step(now.compass_rad, now.motion)))
+        decision = cells = None
+        if leader.relaxes_map:
+            if any(p.vetoes(now.view) for p in self._with["vetoes"]):
+                now = now._replace(vetoed=True)
+            decision, cells = leader.decide(self.map, now), leader.estimate
+        self._exchange(made)
+        for population in self._with["learn"]:
+            population.learn(now, observed[population.kind])
+        for population in self._with["recall"]:
+            belief = None if population is leader else leader.belief(self.map)
+            correction = population.recall(now, observed[population.kind], belief)
+            self._exchange([(population, correction)])
+        if decision is None:
+            decision, cells = leader.decide(self.map, now), leader.estimate
+        return self._finish(accepted, now, decision, cells)
+
+    def _accept(self, frame: Frame) -> Accepted:
+        """Find in a frame what the brain has cells for; whatever is refused is refused here."""
         try:
             dt_s = self._elapsed(frame)
-            sensed = self._sense(frame)
-            velocity = self._velocity(frame, dt_s)
+            observed = dict.fromkeys(self._populations)
+            if self._has_compass and not math.isfinite(frame.heading_rad or 0.0):
+                raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
+            for population in self._with["observe"]:
+                observed[population.kind] = population.observe(frame)
+            view = None
+            if self._makes_views and frame.image is not None:
+                view = self.view.look(frame.image)
+            velocity, profiles = self._velocity(frame, dt_s)
+            gap = dt_s > self.config.max_gap_s
+            if not gap and self._with["check"]:  # after a gap there is another map
+                self._check(frame, observed, Motion(*velocity, dt_s))
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
-        seen = sensed.view
-        gap = dt_s > self.config.max_gap_s
-        carried = seen is not None and self.continuity.breaks(seen) and self._detects
-        if gap or carried:
+        return Accepted(frame, view, observed, velocity, dt_s, profiles, gap)
+
+    def _check(self, frame: Frame, observed: dict[str, Any], motion: Motion) -> None:
+        now, leader = StepInput(frame.index, motion, BLIND, frame.heading_rad), self.leader
+        for population in self._with["check"]:
+            belief = None if population is leader else leader.belief(self.map)
+            population.check(now, observed[population.kind], belief)
+
+    def _enter(self, accepted: Accepted) -> StepInput:
+        """Begin a frame: recognise its view, on a new map where the robot did not drive there."""
+        frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
+        if accepted.profiles is not None:
+            self.odometry.remember(accepted.profiles)
+        gap = accepted.gap
+        kidnapped = view is not None and self.continuity.breaks(view) and self._detects
+        if gap or kidnapped:
             self.start_new_map("gap" if gap else "carried")
-            if gap or frame.velocity is None or self.config.odometry.use == "visual":
+            if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
-        motion = Motion(*velocity, dt_s)
         self.continuity.moved(velocity, dt_s)
-        view = BLIND if seen is None else self.view.recognise(seen)
+        match = BLIND if view is None else self.view.recognise(view)
         if not self.sessions.sessions:
-            self._name_session(frame, sensed)
-        place, lost, turn = NO_EXPERIENCE, False, 0.0
-        if self.config.has("place"):
-            turn = self.navigation.heading_error_rad
-            where = self.navigation.live(motion, frame.heading_rad, sensed.walls)
-            turn -= self.navigation.heading_error_rad
-            place, lost = NO_EXPERIENCE if where.lost else int(where.place), bool(where.lost)
-        if self.config.has("pose"):
-            turn += self._turn_by_compass(frame.heading_rad, motion)
-            cells = self.pose_cells(motion, view)
-            elsewhere = self.config.has("place") and self.navigation.contradicts(view)
-            action, experience = self.map(motion, view, cells, frame.index, carried=elsewhere)
-            if self.config.has("place"):
-                self._correct(*where.correction_m.tolist(), turn, self.navigation.pose.theta_rad)
-                self.navigation.see(view)
-            else:
-                self._correct(0.0, 0.0, turn, 0.0)
-        if self.config.has("semantic"):
-            told = self._meet_landmarks(frame, motion, sensed.landmarks, view)
-            lost = lost or told.lost
-        if not self.config.has("pose"):
-            at = None
-            if self.config.has("place"):
-                pose = self.navigation.pose
-            else:
-                pose = self.semantic.pose
-                place, at = self.semantic.place_of(told.landmark, self.map.n)
-            cells = PoseEstimate(pose.x_m, pose.y_m, 0.0)
-            action, experience = self.map.visit(place, pose, dt_s, frame.index, at)
+            self._name_session(accepted)
+        return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
+
+    def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
+        """Let the map and all populations follow corrections, but for their authors."""
+        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        if not some:
+            return
+        leader = self.leader
+        if leader.relaxes_map:
+            self.map.follow(total([c for _, c in some]))
+        for follower in self._with["follow"]:
+            others = [c for author, c in some if author is not follower]
+            if others:
+                both = total(others)
+                follower.follow(both if follower is leader else both._replace(position_m=None))
+
+    def _finish(
+        self, accepted: Accepted, now: StepInput, decision: Decision, cells: PoseEstimate
+    ) -> StepResult:
+        """End a frame: count it, and join a stored map where it is surely recognised."""
+        frame, view, (action, experience) = accepted.frame, now.view, decision
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
-        self.clock.after_gap_s = -math.inf
+        self._after_gap_s = -math.inf
         self.sessions.now.frames += 1
-        if seen is not None and action in ("create", "link") and self._recognise(frame, seen, view):
+        lost = any(population.lost for population in self._populations.values())
+        arrived = accepted.view is not None and action in ("create", "link")
+        if arrived and self._recognise(frame, accepted.view, view):
             view = view._replace(template=self.view.last.template, is_new=False)
-            cells, action, experience = self.pose_cells.estimate, "set", self.map.current
+            cells, action, experience = self.leader.estimate, "set", self.map.current
         return StepResult(
             frame=frame.index,
             time_s=frame.time_s,
-            motion=motion,
+            motion=now.motion,
             view=view,
             action=action,
             experience=experience,
@@ -208,97 +287,36 @@ class NavigationBrain(nn.Module):
             lost=lost,
         )
 
-    def _sense(self, frame: Frame) -> Sensed:
-        """Find in a frame what the brain has cells for; checked, and nothing changed by it."""
-        config, image = self.config, frame.image
-        walls = view = None
-        landmarks = []
-        compass = config.cells != ("pose",) and frame.heading_rad is not None
-        if compass and not math.isfinite(frame.heading_rad):
-            raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
-        if config.has("place") and frame.walls is not None:
-            check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
-            walls = frame.walls
-        elif config.has("place") and frame.ranges is not None:
-            walls = walls_in_scan(frame.ranges, config.boundary_cells.reach_m)
-        if config.has("semantic"):
-            if "given" in config.semantic.landmarks and frame.landmarks is not None:
-                landmarks.append(frame.landmarks)
-            if "markers" in config.semantic.landmarks and image is not None:
-                landmarks.append(self._markers(image))
-        if config.has("pose") and image is not None:
-            view = self.view.look(image)
-        return Sensed(view, walls, Sightings.of(*landmarks))
+    def merge(
+        self, partial: "NavigationBrain", match: Match
+    ) -> tuple["NavigationBrain | None", MergeReport]:
+        """Merge the map of another session into this one; neither brain is altered.
 
-    @cached_property
-    def _markers(self) -> MarkerDetector:
-        c = self.config
-        return MarkerDetector(
-            c.semantic.markers, c.semantic.marker_size_m, c.odometry.fov_deg, c.view.panoramic
-        )
+        Args:
+            partial: The brain whose session goes on: its activity, time and odometry are kept.
+            match: Where the two maps meet, as :func:`~neuroslam.merging.match.find_match` tells.
 
-    def _turn_by_compass(self, heading_rad: float | None, motion: Motion) -> float:
-        """By how much the map turns, so that its heading follows a compass within seconds.
+        Returns:
+            The merged brain, or ``None`` where the merge is refused, and the report.
 
-        Pose cells and map alone do without, as RatSLAM does.
+        Raises:
+            MapError: If the match names experiences that are not there.
         """
-        now, cells = self.compass, self.config.cells
-        if cells == ("pose",) or (heading_rad is None and not now.known):
-            return 0.0
-        now.heading_rad += motion.w_rad_s * motion.dt_s
-        if heading_rad is None:
-            return 0.0
-        if not now.known:
-            now.heading_rad, now.known = heading_rad, 1
-        off = wrap_angle(heading_rad - now.heading_rad)
-        turn = off * (1.0 - math.exp(-motion.dt_s / _COMPASS_S))
-        now.heading_rad += turn
-        return turn
-
-    def _meet_landmarks(
-        self, frame: Frame, motion: Motion, landmarks: Sightings, view: ViewMatch
-    ) -> Told:
-        """Learn the landmarks in sight; let map and other cells follow what known ones correct."""
-        if "views" in self.config.semantic.landmarks and view.template != NO_TEMPLATE:
-            landmarks = landmarks.with_view(view.template)
-        guide = None
-        if self.config.has("pose"):
-            poses = self.map.experiences["pose"].numpy(force=True)
-            self.semantic.follow_map(poses)
-            guide = Guide(self.map.pose, 0.0, self.map.current, poses)
-        elif self.config.has("place"):
-            guide = Guide(self.navigation.pose, self.navigation.variance_m2)
-        told = self.semantic.live(
-            motion, landmarks, compass_rad=frame.heading_rad, guide=guide, frame=frame.index
-        )
-        if self.config.has("pose"):
-            (x, y), facing = told.correction_m, self.map.pose.theta_rad
-            self._correct(x, y, told.turn_rad, facing)
-            if told.lost and self.config.has("place"):
-                here = self.navigation.pose
-                x, y = _rotated(x, y, here.theta_rad - facing)
-                moved = Pose(here.x_m + x, here.y_m + y, here.theta_rad)
-                self.navigation.go_to(moved, self.config.semantic.sigma_m)
-        elif self.config.has("place") and told.place_m is not None:
-            sigma = self.config.semantic.sigma_m
-            if told.lost:  # it was carried there
-                heading = self.navigation.pose.theta_rad
-                self.navigation.go_to(Pose(*told.place_m, heading), sigma)
-            else:
-                self.navigation.hear(told.place_m, sigma, told.variance_m2)
-        return told
-
-    def _correct(self, x_m: float, y_m: float, turn_rad: float, heading_rad: float) -> None:
-        """Let pose cells and map follow a correction, in the frame of one who has that heading."""
-        if x_m == y_m == turn_rad == 0.0:
-            return
-        cells = self.config.pose_cells
-        facing = TWO_PI * self.pose_cells.estimate.theta / cells.n_theta
-        self.map.nudge(*_rotated(x_m, y_m, self.map.pose.theta_rad - heading_rad), turn_rad)
-        self.pose_cells.nudge(
-            *(way / cells.cell_size_m for way in _rotated(x_m, y_m, facing - heading_rad)),
-            turn_rad * cells.n_theta / TWO_PI,
-        )
+        state, _, report = merge(self, partial, match)
+        if state is None:
+            return None, report
+        merged = NavigationBrain(partial.config)
+        merged.restore(state, [*map(deepcopy, self.stored), *map(deepcopy, partial.stored)])
+        merged.to(partial.map.experiences["pose"].device)
+        counts = [counts_of(brain) for brain in (self, partial, merged)]
+        report.counts |= {
+            name: dict(zip(("loaded", "partial", "merged"), values, strict=True))
+            for name, value in counts[2].items()
+            if name not in report.counts and isinstance(value, int)
+            for values in ([count[name] for count in counts],)
+        }
+        merged.sessions.merges.append(report.to_dict())
+        return merged, report
 
     def store(self, other: "NavigationBrain") -> None:
         """Remember the maps of another brain; when one is recognised, it is joined to this map.
@@ -324,10 +342,10 @@ class NavigationBrain(nn.Module):
 
     def _store_one(self, one: "NavigationBrain") -> None:
         copy = NavigationBrain(one.config)
-        copy.take(one.state_dict(), [])
+        copy.restore(one.state_dict(), [])
         for i, before in enumerate(self.stored):
             shared = shared_history(before, copy)
-            merged = merge(before, copy, shared.match)[0] if shared and shared.match else None
+            merged = before.merge(copy, shared.match)[0] if shared and shared.match else None
             if merged is not None:  # what became of one map in two sessions
                 self.stored[i] = merged
                 return
@@ -347,11 +365,10 @@ class NavigationBrain(nn.Module):
         before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
         senses = self.odometry, self.continuity  # they go on: this frame is the next one's before
         kept = NavigationBrain(self.config)
-        kept.take({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
+        kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
         self._begin()
         self.odometry, self.continuity = senses
-        self.view.go_on_from(kept.view)
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)
         self.recognition.store()
@@ -367,7 +384,7 @@ class NavigationBrain(nn.Module):
         )
         self._open(session)
 
-    def take(self, state: State, stored: Sequence["NavigationBrain"]) -> None:
+    def restore(self, state: State, stored: Sequence["NavigationBrain"]) -> None:
         """Go on with another state, and with these stored maps."""
         self._begin()
         self.stored = nn.ModuleList(stored)
@@ -381,8 +398,11 @@ class NavigationBrain(nn.Module):
         while tally.n < len(stored):
             tally.append(alike=0, agreed=0)
 
-    def _name_session(self, frame: Frame, sensed: Sensed) -> None:
-        """Open a session, or give the one that was announced its id, by what it begins with."""
+    def _name_session(self, accepted: Accepted) -> None:
+        """Open a session; its id follows from what it begins with."""
+        frame, found = accepted.frame, []
+        for observation in accepted.observed.values():
+            found += observation if isinstance(observation, tuple) else [observation]
         self._open(
             Session(
                 session_id(
@@ -393,8 +413,8 @@ class NavigationBrain(nn.Module):
                     float(frame.time_s),
                     frame.image,
                     frame.velocity,
-                    *((frame.heading_rad, sensed.walls) if self.config.has("place") else ()),
-                    *(sensed.landmarks if self.config.has("semantic") else ()),
+                    frame.heading_rad,
+                    *found,
                 ),
                 *self.about,
                 frame.index,
@@ -446,7 +466,7 @@ class NavigationBrain(nn.Module):
         rest = [one for i, one in enumerate(self.stored) if i != where]
         loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
         self.stored = nn.ModuleList()  # what else is stored is neither copied nor looked at
-        merged, report = merge(loaded, self, match)
+        merged, report = loaded.merge(self, match)
         self.stored = everything
         report.at_frame = frame.index
         if merged is None:
@@ -454,7 +474,7 @@ class NavigationBrain(nn.Module):
             self.sessions.refusals.append(report.to_dict())
             return False
         merged.sessions.merges[-1] = report.to_dict()
-        for name, part in merged.populations().items():
+        for name, part in merged.parts().items():
             setattr(self, name, part)
         self.view.encoder = self._encoder
         self.stored = nn.ModuleList(rest)
@@ -481,7 +501,7 @@ class NavigationBrain(nn.Module):
                 "places_that_agree": agreed,
                 "reason": "maps without views are laid on each other when they are finished: "
                 "neuroslam merge"
-                if not self.config.has("pose")
+                if not self._makes_views
                 else f"{counted(alike, 'place')} looked like one of it, {agreed} at most agreed on "
                 f"how the maps lie; {needed} must",
             }
@@ -492,11 +512,10 @@ class NavigationBrain(nn.Module):
 
     @property
     def landmarks_m(self) -> np.ndarray | None:
-        """Where landmarks are on the map, ``(n, 2)``, views left out; ``None``: it has no cells."""
-        if not self.config.has("semantic"):
-            return None
-        known = self.semantic.landmarks()
-        return known["place_m"][known["kind"] != VIEW]
+        """Points that populations want drawn on the map, ``(n, 2)``; ``None``: none has any."""
+        points = [p.points_m() for p in self._populations.values()]
+        known = [rows for rows in points if rows is not None]
+        return np.concatenate(known) if known else None
 
     def place(self, experience: int, offset: Pose) -> Pose:
         """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.
@@ -521,34 +540,33 @@ class NavigationBrain(nn.Module):
         if dt_s > self.config.max_gap_s and self.config.sessions.after_gap == "new_map":
             return float(dt_s)
         if dt_s > self.config.max_gap_s:
-            since_s = frame.time_s - self.clock.after_gap_s
+            since_s = frame.time_s - self._after_gap_s
             if 0.0 < since_s <= self.config.max_gap_s:
                 return float(since_s)  # the gap is real: what was missed in it stays unknown
-            self.clock.after_gap_s = float(frame.time_s)
+            self._after_gap_s = float(frame.time_s)
             raise BadFrame(
                 f"{dt_s:g} s after frame {self.clock.frame}, more than "
                 f"max_gap_s = {self.config.max_gap_s:g}; raise it if the gap is real"
             )
         return float(dt_s)
 
-    def _velocity(self, frame: Frame, dt_s: float) -> Velocity:
+    def _velocity(self, frame: Frame, dt_s: float) -> tuple[Velocity, Profiles | None]:
         use = self.config.odometry.use
         if use != "visual" and frame.velocity is not None:
             if not all(map(math.isfinite, frame.velocity)):
                 v, w = frame.velocity
                 raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
-            return Velocity(*map(float, frame.velocity))
+            return Velocity(*map(float, frame.velocity)), None
         if use == "given" or frame.image is None:
             raise BadFrame(
                 "no odometry in the source"
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
-        return self.odometry(frame.image, dt_s)
+        return self.odometry.measure(frame.image, dt_s)
 
 
-def _rotated(x: float, y: float, by_rad: float) -> tuple[float, float]:
-    c, s = math.cos(by_rad), math.sin(by_rad)
-    return c * x - s * y, s * x + c * y
+def _overrides(population: type[Population], hook: str) -> bool:
+    return getattr(population, hook) is not getattr(Population, hook)
 
 
 def _make_stored(module: NavigationBrain, state: State, prefix: str, *_unused: object) -> None:

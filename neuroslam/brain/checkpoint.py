@@ -6,12 +6,12 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
-from neuroslam.state.sessions import Session, session_id
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError
 from neuroslam.state.files import first_line, load_checked, save_checked
+from neuroslam.state.sessions import Session, session_id
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> None:
@@ -41,6 +41,8 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         tensors = _of_one_session(tensors, config, about["sha256"])
     elif about["format"] == 2:
         tensors = _with_compass(tensors, config)
+    if about["format"] < 4:
+        tensors = _without_unused(tensors, config)
     return config, tensors
 
 
@@ -72,6 +74,16 @@ def _with_compass(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, 
     brains = [name.removesuffix("clock.frame") for name in tensors if name.endswith("clock.frame")]
     fresh = NavigationBrain(config).compass.state_dict()
     return tensors | {f"{one}compass.{name}": v for one in brains for name, v in fresh.items()}
+
+
+def _without_unused(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, Tensor]:
+    """Drop what formats up to 3 had besides: the time of a gap, pose cells that nothing used."""
+    unused = (".after_gap_s",) if "pose" in config.cells else (".after_gap_s", ".pose_cells")
+    return {
+        name: value
+        for name, value in tensors.items()
+        if not any(f"{part}." in f".{name}." for part in unused)
+    }
 
 
 def _of_one_session(

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.config import BrainConfig
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
 from neuroslam.view.search import Geometry, distances
@@ -20,7 +20,7 @@ _STEP = 0.02
 """Share by which the usual change is corrected in a frame, once it is known roughly."""
 
 
-class Continuity(Running):
+class Continuity(AboutNow):
     r"""Tells from two frames whether the robot could have driven from one to the other.
 
     The change :math:`d` between two frames is the mean difference of their views at the best shift.

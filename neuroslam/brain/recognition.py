@@ -6,8 +6,10 @@ import numpy as np
 import torch
 
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
-from neuroslam.state.population import Join, Population, State
+from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
+from neuroslam.state.join import Join
+from neuroslam.state.match import Pairs
+from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.templates import LocalViewCells
@@ -49,7 +51,7 @@ class StoredViews:
         return min(self.joined.differences(view, rest), default=None)
 
 
-class Recognition(Population):
+class Recognition(Mergeable):
     """What was recognised of stored maps lately: the evidence for joining one."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
 """Zones of the activity of boundary cells, from far to near."""
@@ -96,7 +96,7 @@ def boundary_tuning(
     return by_bearing.mT @ by_distance
 
 
-class BoundaryCells(Running):
+class BoundaryCells(BufferModule):
     """Population of ``n_bearings`` by ``n_distances`` boundary cells.
 
     :func:`boundary_tuning` has the mathematics; :func:`boundary_activity` gates all cells. The

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
-from neuroslam.state.population import Running, without_gradients
+from neuroslam.state.mergeable import BufferModule, without_gradients
 
 SURE = 0.6
 """Share of the reach within which a wall cannot be overlooked."""
@@ -48,7 +48,7 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
     )
 
 
-class Familiarity(Running):
+class Familiarity(BufferModule):
     r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
 
     A wall is near where none ever was, or none is felt where one always was, or one is not where

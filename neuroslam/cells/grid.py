@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from neuroslam.cells.oscillators import wave_vectors
 from neuroslam.config import GridCellConfig
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0
@@ -87,7 +87,7 @@ def lahn_learn(
     return LAHNWeights(q, w, threshold, bias)
 
 
-class LAHNGridCells(Running):
+class LAHNGridCells(BufferModule):
     """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
 
     :func:`lahn_drive` and :func:`lahn_learn` have the mathematics. A network is made with weights

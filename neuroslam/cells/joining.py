@@ -1,6 +1,7 @@
 """How the navigation cells of two sessions become those of one."""
 
 import math
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,10 @@ from neuroslam.cells.boundary_vectors import unlikeness, wrap
 from neuroslam.cells.grid import lahn_drive
 from neuroslam.cells.oscillators import turn_phases, wave_vectors
 from neuroslam.cells.place import EMPTY, FAR_M, NEIGHBOURS
+from neuroslam.errors import listed
 from neuroslam.geometry import TWO_PI, wrap_angle
-from neuroslam.state.population import Join, State
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
 
 
@@ -249,3 +252,31 @@ def _join_views(loaded: State, partial: State, join: Join, frames: Frames) -> St
     rows["x_m"], rows["y_m"] = at[:, 0], at[:, 1]
     rows["heading_rad"] = rows["heading_rad"] + frames.turn_rad
     return {f"seen.{name}": torch.cat([loaded[f"seen.{name}"], row]) for name, row in rows.items()}
+
+
+def navigation_faults(
+    state: Mapping[str, np.ndarray], n_experiences: int | None
+) -> Iterator[str]:
+    """Say what makes no sense in a state of navigation cells.
+
+    Args:
+        state: Of the cells, as arrays.
+        n_experiences: That the map has, where each place cell is one; ``None``: it is not.
+    """
+    n_cells, n_walls = (int(state[name][0]) for name in ("place.n_cells", "walls.n_walls"))
+    if n_experiences not in (None, n_cells):
+        yield f"{n_cells} place cells, {n_experiences} experiences; each should be the other"
+    linked = state["place.neighbours"][0, :n_cells]
+    rows = np.unique(np.nonzero((linked < -1) | (linked >= n_cells))[0])
+    if len(rows):
+        yield f"place cells {listed(rows)}: linked to cells that are not there; there are {n_cells}"
+    norms = np.linalg.norm(state["place.weights"][0, :n_cells], axis=1)
+    rows = np.flatnonzero(np.abs(norms - 1.0) > 1e-3)
+    if len(rows):
+        yield f"place cells {listed(rows)}: weights of norm {listed(norms[rows])}, expected 1"
+    active = state["walls.active"][0]
+    rows = np.flatnonzero((active < -1) | (active >= n_walls))
+    if len(rows):
+        yield f"active walls {listed(rows)}: not remembered; there are {n_walls}"
+    if (np.diag(state["walls.covariance"][0]) < 0).any():
+        yield "navigation.walls.covariance: a variance is negative"

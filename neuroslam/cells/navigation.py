@@ -1,7 +1,8 @@
 """SLRB: boundary cells, grid cells and place cells composed; motion and walls in, a place out."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -10,22 +11,44 @@ from torch import Tensor
 from neuroslam.cells.boundary import BoundaryCells, check_walls
 from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
-from neuroslam.cells.joining import join_navigation
+from neuroslam.cells.joining import join_navigation, navigation_faults, view_frames
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
+from neuroslam.cells.wall_matching import match_walls, outline_of
 from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
-from neuroslam.state.population import Join, Population, State, without_gradients
+from neuroslam.sensors.scan import walls_in_scan
+from neuroslam.state.join import Join
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import State, without_gradients
+from neuroslam.state.population import (
+    Belief,
+    Correction,
+    Decision,
+    LeadableMap,
+    Observation,
+    Population,
+    StepInput,
+)
+from neuroslam.state.registry import leading_class, register
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import NO_TEMPLATE, Motion, Pose, ViewMatch
+from neuroslam.types import (
+    NO_EXPERIENCE,
+    NO_TEMPLATE,
+    Frame,
+    Motion,
+    Pose,
+    PoseEstimate,
+    ViewMatch,
+)
 
 FAMILIARITY_PERIOD_S = 0.5
 """Time between looks at whether a place is what it was."""
 
 
-class Whereabouts(NamedTuple):
+class NavigationEstimate(NamedTuple):
     """What the navigation cells say after a step.
 
     Attributes:
@@ -43,6 +66,7 @@ class Whereabouts(NamedTuple):
     lost: Tensor
 
 
+@register("place")
 class NavigationCells(Population):
     """Boundary, grid and place cells of an animal that knows its motion and the walls around.
 
@@ -67,9 +91,20 @@ class NavigationCells(Population):
         ([0.1, 0.0], 0)
     """
 
+    name = "navigation"
+    merge_sections = ("boundary_cells", "grid_cells", "place_cells")
+    rank = 2
+    compass = "uses"
+
+    @classmethod
+    def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
+        """Make the navigation cells of a brain."""
+        return cls(config)
+
     def __init__(self, config: BrainConfig, batch: int | None = None) -> None:
         super().__init__()
         self.config = config
+        self._estimate: NavigationEstimate | None = None  # of the last frame
         self.batch = batch
         self.boundary = BoundaryCells(config.boundary_cells, batch)
         self.oscillators = VelocityOscillators(config.grid_cells, batch)
@@ -108,7 +143,7 @@ class NavigationCells(Population):
         wall_bearing_rad: Tensor,
         *,
         compass: bool = True,
-    ) -> Whereabouts:
+    ) -> NavigationEstimate:
         """Take in a step of motion and the walls at its end.
 
         Args:
@@ -161,7 +196,7 @@ class NavigationCells(Population):
                 lost = self.familiarity.lost
             now.lost_s += now.since_s * int(lost.sum())
             now.since_s, now.someone_lost = 0.0, int(lost.any())
-        return Whereabouts(
+        return NavigationEstimate(
             oscillators.position_m,
             correction,
             place.winner,
@@ -169,10 +204,30 @@ class NavigationCells(Population):
             lost if self.batch is not None else lost[0],
         )
 
-    def live(
+    def observe(self, frame: Frame) -> np.ndarray | None:
+        """Return the walls of a frame, ``(n, 2)``, measured or found in its ranges.
+
+        Raises:
+            BadFrame: If walls or ranges cannot be that.
+        """
+        if frame.walls is not None:
+            check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
+            return frame.walls
+        if frame.ranges is not None:
+            return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
+        return None
+
+    def step(self, now: StepInput, observation: np.ndarray | None) -> Correction:
+        """Advance by a frame of the brain; return what walls corrected of position and heading."""
+        error = self.heading_error_rad
+        self._estimate = self.advance(now.motion, now.compass_rad, observation)
+        dx, dy = self._estimate.correction_m.tolist()
+        return Correction(dx, dy, error - self.heading_error_rad, self.pose.theta_rad)
+
+    def advance(
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
-    ) -> Whereabouts:
-        """Take in a frame of one animal; :meth:`forward` with what a frame has.
+    ) -> NavigationEstimate:
+        """Advance one animal by a frame; :meth:`forward` with what a frame has.
 
         Args:
             motion: Since the last frame.
@@ -212,7 +267,18 @@ class NavigationCells(Population):
         x, y = self.oscillators.position_m.tolist()
         return Pose(x, y, wrap_angle(self.now.heading_rad - self.heading_error_rad))
 
-    def contradicts(self, view: ViewMatch) -> bool:
+    @property
+    def estimate(self) -> PoseEstimate:
+        """Position in metres, as ``frames.csv`` has it of a brain without pose cells."""
+        x, y, _ = self.pose
+        return PoseEstimate(x, y, 0.0)
+
+    @property
+    def lost(self) -> bool:
+        """Whether walls contradict what is known of the place, since the last frame."""
+        return self._estimate is not None and bool(self._estimate.lost)
+
+    def vetoes(self, view: ViewMatch) -> bool:
         """Say whether a known view was learnt where the animal cannot be, as it believes."""
         if view.is_new or view.template == NO_TEMPLATE or not self.seen["sure"][view.template]:
             return False
@@ -224,8 +290,37 @@ class NavigationCells(Population):
     def _view_reach_m(self) -> float:
         return 3.0 * self.config.wall_memory.view_sigma_m
 
+    def learn(self, now: StepInput, observation: Observation) -> None:
+        """Learn where a view is, or be corrected by it; see :meth:`update_from_view`."""
+        self.update_from_view(now.view)
+
+    def follow(self, correction: Correction) -> None:
+        """Be corrected by a landmark, or go where a kidnapped robot has found itself.
+
+        Small corrections of a map do not move the cells: their own walls are more accurate.
+        """
+        here, position = self.pose, correction.position_m
+        if correction.relocalises:
+            if position is None:
+                dx, dy = correction.displacement(here.theta_rad)
+                position = (here.x_m + dx, here.y_m + dy)
+            self.relocalise(Pose(*position, here.theta_rad), correction.sigma_m)
+        elif position is not None:
+            self.update_from_landmark(position, correction.sigma_m, correction.variance_m2)
+
+    def belief(self, map_: LeadableMap) -> Belief:
+        """Return pose and variance of the cells."""
+        return Belief(self.pose, self.variance_m2)
+
+    def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
+        """Go to the experience of the place cell that wins; each place cell is one."""
+        winner = NO_EXPERIENCE
+        if self._estimate is not None and not self.lost:
+            winner = int(self._estimate.place)
+        return Decision(*map_.visit(winner, self.pose, now.motion.dt_s, now.frame))
+
     @without_gradients
-    def see(self, view: ViewMatch) -> bool:
+    def update_from_view(self, view: ViewMatch) -> bool:
         """Learn where a new view is, or be corrected by where a known one was learnt.
 
         A view near where it was learnt corrects the position a little. Where several views in a row
@@ -263,7 +358,7 @@ class NavigationCells(Population):
         needed = self.config.sessions.confirm
         if now.views_agree < (max(2, needed // 2) if now.someone_lost else needed):
             return False
-        self.go_to(Pose(x, y, heading + view.relative_heading_rad), sigma)
+        self.relocalise(Pose(x, y, heading + view.relative_heading_rad), sigma)
         return True
 
     def remembered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -283,7 +378,7 @@ class NavigationCells(Population):
         return 0.5 * self.walls.expected_variance_m2[0].trace().item()
 
     @without_gradients
-    def hear(self, place_m: tuple[float, float], sigma_m: float, variance_m2: float) -> bool:
+    def update_from_landmark(self, place_m: tuple[float, float], sigma_m: float, variance_m2: float) -> bool:
         r"""Be corrected by where a known landmark puts one animal.
 
         A landmark makes no one surer than who learnt it was: its error is taken to be the
@@ -314,7 +409,7 @@ class NavigationCells(Population):
         return True
 
     @without_gradients
-    def go_to(self, pose: Pose, sigma_m: float) -> None:
+    def relocalise(self, pose: Pose, sigma_m: float) -> None:
         """Set pose and phases of one animal anew; what it remembers stays.
 
         Args:
@@ -329,7 +424,53 @@ class NavigationCells(Population):
         self.familiarity.reset_doubt()
         now.someone_lost = now.views_agree = 0
 
-    @staticmethod
-    def merged(loaded: State, partial: State, join: Join) -> State:
+    @property
+    def rates(self) -> np.ndarray:
+        """Rates of boundary cells, then of grid cells, of one animal."""
+        parts = (self.boundary.rates, self.grid.rates)
+        return np.concatenate([part.flatten().numpy(force=True) for part in parts])
+
+    def counts(self) -> dict[str, float]:
+        """Return the numbers of what one animal has learnt, and for how long it was lost."""
+        return {
+            "place_cells": int(self.place.n_cells),
+            "walls": int(self.walls.n_walls),
+            "activated_boundary_cells": int(self.familiarity.n_activated()),
+            "lost_s": round(self.now.lost_s, 3),
+        }
+
+    def scalars(self) -> dict[str, float]:
+        """Return what TensorBoard shows of one animal."""
+        return {
+            "cells/place_cells": float(self.place.n_cells),
+            "cells/walls": float(self.walls.n_walls),
+            "cells/activated_boundary_cells": float(self.familiarity.n_activated()),
+            "cells/boundary_activity": float(self.boundary.activity),
+            "cells/doubt_s": float(self.familiarity.doubt_s),
+        }
+
+    @classmethod
+    def faults(
+        cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
+    ) -> Iterator[str]:
+        """Say where place cells, their links or walls are not there."""
+        yield from navigation_faults(state, n_experiences if leading_class(config) is cls else None)
+
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Join places, walls and views of two sessions in the frame of the loaded one."""
         return join_navigation(loaded, partial, join)
+
+    def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
+        """Say how the sessions' frames lie by the views that both know."""
+        return view_frames(loaded, partial, join)
+
+    def match(
+        self, loaded: "Population", maps: tuple[np.ndarray, np.ndarray], config: BrainConfig
+    ) -> tuple[Match | None, str]:
+        """Align the walls that two sessions remember."""
+        if not isinstance(loaded, NavigationCells):
+            raise TypeError(f"NavigationCells: cannot be matched with {type(loaded).__name__}")
+        both = loaded, self
+        compass = all(cells.now.compass for cells in both)
+        outlines = tuple(outline_of(*cells.walls.remembered()[0][:4]) for cells in both)
+        return match_walls(outlines, maps, config, compass=compass)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.config import GridCellConfig
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
@@ -91,7 +91,7 @@ def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor)
     return near_m + z.angle().flatten(-2) @ solver.mT
 
 
-class VelocityOscillators(Running):
+class VelocityOscillators(BufferModule):
     """Modules of oscillators whose phases integrate motion; state: ``phases`` and ``position_m``.
 
     :func:`turn_phases` has the mathematics. The field spacings are parameters.

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.config import PlaceCellConfig
-from neuroslam.state.population import Running, without_gradients
+from neuroslam.state.mergeable import BufferModule, without_gradients
 from neuroslam.state.tables import Scalars
 
 NEIGHBOURS = 12
@@ -76,7 +76,7 @@ def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
     return torch.nn.functional.normalize(torch.lerp(weights, grid, rate), dim=-1)
 
 
-class CompetitiveHebbianPlaceCells(Running):
+class CompetitiveHebbianPlaceCells(BufferModule):
     """Place cells that compete for the patterns of grid cells; a new one is recruited far from all.
 
     :func:`place_response` and :func:`hebbian_step` have the mathematics. The winner is found among

@@ -1,8 +1,11 @@
 """Pose cells: a belief over x, y and heading that follows odometry and is corrected by views."""
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,16 +18,31 @@ from neuroslam.cells.attractor import (
     settle,
 )
 from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense, to_packet
+from neuroslam.cells.pose_joining import move_session
 from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all
-from neuroslam.config import PoseCellConfig
-from neuroslam.errors import MapError
+from neuroslam.config import BrainConfig, PoseCellConfig
+from neuroslam.errors import MapError, listed
 from neuroslam.geometry import TWO_PI
-from neuroslam.state.population import Join, Population, State, renamed
+from neuroslam.state.join import Join, MovedCells
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import State, renamed
+from neuroslam.state.population import (
+    Belief,
+    Correction,
+    Decision,
+    LeadableMap,
+    Observation,
+    Population,
+    StepInput,
+)
+from neuroslam.state.registry import register
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
-_TIRED = math.log(30.0) / 1.2
+SATURATED_DECAY = math.log(30.0) / 1.2
 """Decay at which a view injects nothing any more."""
+
+_SUM_TOLERANCE = {"float32": 1e-4, "float64": 1e-9}
 
 
 @dataclass
@@ -39,6 +57,7 @@ def _no_slip(like: Tensor) -> list[float] | Tensor:
     return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
 
 
+@register("pose")
 class PoseCellNetwork(Population):
     """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet is the pose belief.
 
@@ -60,8 +79,19 @@ class PoseCellNetwork(Population):
         (0.99, 0.0)
     """
 
+    name = "pose_cells"
+    merge_sections = ("pose_cells",)
+    rank = 3
+    relaxes_map = True
+    needs_views = True
+
     window: Tensor
     origin: Tensor
+
+    @classmethod
+    def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
+        """Make the pose cells of a brain."""
+        return cls(config.pose_cells)
 
     def __init__(self, config: PoseCellConfig, batch: int | None = None) -> None:
         super().__init__()
@@ -260,7 +290,7 @@ class PoseCellNetwork(Population):
         if view.template == self.last.view:
             b["decay"][view.template] += c.active_decay
         decay = b["decay"][view.template].item()
-        if decay >= _TIRED:
+        if decay >= SATURATED_DECAY:
             return
         energy = c.inject_energy / 30.0 * (30.0 - math.exp(1.2 * decay))
         turned = view.relative_heading_rad * c.n_theta / TWO_PI
@@ -279,8 +309,45 @@ class PoseCellNetwork(Population):
         self.see(view)
         return self.integrate(motion)
 
-    @staticmethod
-    def merged(loaded: State, partial: State, join: Join) -> State:
+    def step(self, now: StepInput, observation: Observation) -> None:
+        """Advance by a frame of the brain; see :meth:`forward`."""
+        self(now.motion, now.view)
+
+    @property
+    def heading_rad(self) -> float:
+        """Heading of the estimate in the frame of the cells."""
+        return TWO_PI * self.estimate.theta / self.config.n_theta
+
+    def follow(self, correction: Correction) -> None:
+        """Move and turn the belief by what another population has corrected."""
+        if not correction.moves:
+            return
+        c = self.config
+        dx, dy = correction.displacement(self.heading_rad)
+        self.nudge(
+            dx / c.cell_size_m, dy / c.cell_size_m, correction.turn_rad * c.n_theta / TWO_PI
+        )
+
+    def belief(self, map_: LeadableMap) -> Belief:
+        """Return the pose on the map: the cells repeat themselves on the torus."""
+        return Belief(map_.pose, 0.0, map_.current, map_.pose_table)
+
+    def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
+        """Create, link or set an experience by the view and the pose at which it was learnt."""
+        return Decision(
+            *map_(now.motion, now.view, self.estimate, now.frame, carried=now.vetoed)
+        )
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Activity of all cells, ``(n_theta * n_xy * n_xy,)``."""
+        return self.activity.flatten().numpy(force=True)
+
+    def scalars(self) -> dict[str, float]:
+        """Return the activity of the most active cell."""
+        return {"cells/peak": self.peak}
+
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Move bindings and activity of the partial session on the torus, and join the bindings.
 
         The activity moves too, so that the belief is where the robot is (multisession RatSLAM,
@@ -306,6 +373,40 @@ class PoseCellNetwork(Population):
             "slip": partial["slip"],
             "last.view": renamed(partial["last.view"], join.views),
         }
+
+    def moved_cells(
+        self, loaded: State, partial: State, match: Match, config: BrainConfig
+    ) -> MovedCells:
+        """Move the partial session on the torus, so that the matched experience is at one pose."""
+        return move_session(loaded, partial, match, config)
+
+    @classmethod
+    def faults(
+        cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
+    ) -> Iterator[str]:
+        """Say where activity or bindings cannot be those of pose cells."""
+        window, origin, bound = state["window"], state["origin"].tolist(), len(state["bindings.x"])
+        if bound != n_views:
+            yield f"{n_views} views, {bound} of them bound to pose cells"
+        c = config.pose_cells
+        torus = (c.n_theta, c.n_xy, c.n_xy)
+        if not -1 <= state["last.view"] < n_views:
+            yield f"{cls.name}.last.view: is {state['last.view']}, expected -1 to {n_views - 1}"
+        if not all(0 < size <= limit for size, limit in zip(window.shape, torus, strict=True)):
+            yield f"{cls.name}.window: {window.shape} cells do not fit the torus of {torus}"
+        if not all(0 <= at < limit for at, limit in zip(origin, torus, strict=True)):
+            yield f"{cls.name}.origin: {tuple(origin)} is not on the torus of {torus}"
+        if (window < 0).any():
+            cell = tuple(np.argwhere(window < 0)[0].tolist())
+            yield f"{cls.name}.window: {int((window < 0).sum())} cells are negative, the first {cell}"
+        total = window.sum(dtype=np.float64).item()
+        if abs(total - 1.0) > _SUM_TOLERANCE[window.dtype.name]:
+            yield f"{cls.name}.window: adds up to {total:.6g}, expected 1"
+        for axis, limit in zip(("x", "y", "theta"), torus[::-1], strict=True):
+            at = state[f"bindings.{axis}"]
+            rows = np.flatnonzero((at < 0) | (at > limit))
+            if len(rows):
+                yield f"{cls.name}.bindings.{axis}: rows {listed(rows)} are not on the torus of {torus}"
 
     def _write_buffers(self) -> None:
         packet, slip = self._now.packet, self._now.slip

@@ -1,19 +1,17 @@
-"""Where do two maps meet that have no views? Their remembered walls are laid on each other."""
+"""Alignment of two maps without views by the walls that both sessions remember."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from torch import Tensor
 
-from neuroslam.merging.merge import Match
+from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
-from neuroslam.mapping.overlap import Pairs
+from neuroslam.state.match import Match, Pairs
 from neuroslam.types import Pose
-
-if TYPE_CHECKING:
-    from neuroslam.brain.brain import NavigationBrain
 
 _LEAST_WALLS = 6
 _LEAST_SHARE = 0.6  # of the smaller memory's walls must find their like
@@ -40,7 +38,7 @@ class Outline(NamedTuple):
         return Outline(self.feet_m @ turn.T + move_m, wrap_angles(self.bearing_rad + turn_rad))
 
 
-class Laid(NamedTuple):
+class OutlineAlignment(NamedTuple):
     """How one outline lies in another.
 
     Attributes:
@@ -60,9 +58,9 @@ class Laid(NamedTuple):
     spread: float
 
 
-def lay_walls(
+def align_outlines(
     loaded: Outline, partial: Outline, turns_rad: list[float], reach_m: float, off_m: float
-) -> Laid:
+) -> OutlineAlignment:
     r"""Find the motion that lays one outline on another, by trying all and refining the best.
 
     A wall finds its like where a foot of the other outline with that bearing is within ``reach_m``
@@ -122,7 +120,7 @@ def _refine(
     move: np.ndarray,
     reach_m: float,
     off_m: float,
-) -> Laid:
+) -> OutlineAlignment:
     width, n_same, residual, spread = reach_m, 0, math.inf, 0.0
     for _ in range(_ROUNDS):
         moved = partial.moved(turn, move)
@@ -141,7 +139,7 @@ def _refine(
             if abs(across[b]) < width:
                 rows.append((*moved.feet_m[k], *normal[b], across[b]))
         if len(rows) < _LEAST_WALLS:
-            return Laid(turn, move, len(rows), math.inf, 0, 0.0)
+            return OutlineAlignment(turn, move, len(rows), math.inf, 0, 0.0)
         table = np.array(rows)
         feet, normals, across = table[:, :2], table[:, 2:4], table[:, 4]
         centre = feet.mean(0)
@@ -159,67 +157,79 @@ def _refine(
         residual = float(np.sqrt(np.mean(np.square(across[same])))) if same.any() else math.inf
         spread = float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
         width = max(off_m, width / 2.0)
-    return Laid(turn, move, n_same, residual, 0, spread)
+    return OutlineAlignment(turn, move, n_same, residual, 0, spread)
 
 
-def match_walls(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Match | None, str]:
-    """Look for how the walls that two animals remember lie on each other.
+def match_walls(
+    outlines: tuple[Outline, Outline],
+    maps: tuple[np.ndarray, np.ndarray],
+    config: BrainConfig,
+    *,
+    compass: bool,
+) -> tuple[Match | None, str]:
+    """Align the walls that two sessions remember.
 
     Args:
-        loaded: One brain with place cells; it is not altered.
-        partial: The other; it is not altered.
+        outlines: Of the loaded session and of the partial one.
+        maps: Poses of their experiences, ``(n, 3)`` each.
+        config: Of both.
+        compass: Both had a compass, so neither is turned.
 
     Returns:
         Where the maps meet, or ``None``; and how that was found, or why not, for a reader.
     """
-    outlines = [outline_of(brain) for brain in (loaded, partial)]
     counts = [len(outline.feet_m) for outline in outlines]
     needed = max(_LEAST_WALLS, math.ceil(_LEAST_SHARE * min(counts)))
     if min(counts) < _LEAST_WALLS:
         return None, (
             f"the maps remember {counts[0]} and {counts[1]} stretches of wall; both need "
-            f"{_LEAST_WALLS} to be laid on each other"
+            f"{_LEAST_WALLS} to be aligned"
         )
-    config = partial.config.wall_memory
-    compass = all(brain.navigation.now.compass for brain in (loaded, partial))
+    memory = config.wall_memory
     turns = [0.0] if compass else [TWO_PI * k / _TURNS for k in range(_TURNS)]
-    off_m = _OFF_SIGMAS * config.sigma_m
-    laid = lay_walls(*outlines, turns, config.spread_m, off_m)
-    said = (
-        f"{laid.n_same} of {counts[1]} stretches of wall lie on those of the other map, off by "
-        f"{laid.off_m:.3f} m"
+    off_m = _OFF_SIGMAS * memory.sigma_m
+    best = align_outlines(*outlines, turns, memory.spread_m, off_m)
+    aligned = (
+        f"{best.n_same} of {counts[1]} stretches of wall align with the other map's, "
+        f"residual {best.off_m:.3f} m"
     )
-    if laid.n_same < needed:
-        return None, f"at most {said}; {needed} must"
-    if laid.off_m > _RMS_SIGMAS * config.sigma_m:
-        return None, f"{said}; walls of one place would be by {_RMS_SIGMAS * config.sigma_m:.3f} m"
-    if laid.spread < _LEAST_SPREAD:
-        return None, f"{said}, but they are all parallel: the maps could slide along them"
-    if laid.runner_up > _CLEARLY * laid.n_same:
-        return None, f"{said}, but {laid.runner_up} do when the map is laid quite otherwise too"
-    match = _places(loaded, partial, laid)
+    if best.n_same < needed:
+        return None, f"at most {aligned}; {needed} must"
+    if best.off_m > _RMS_SIGMAS * memory.sigma_m:
+        return None, (
+            f"{aligned}; walls of one place leave at most {_RMS_SIGMAS * memory.sigma_m:.3f} m"
+        )
+    if best.spread < _LEAST_SPREAD:
+        return None, f"{aligned}, but they are all parallel: the maps could slide along them"
+    if best.runner_up > _CLEARLY * best.n_same:
+        return None, f"{aligned}, but {best.runner_up} do in quite another alignment, too"
+    match = _same_experiences(maps, best, config.place_cells.threshold_m)
     if match is None:
-        return None, f"{said}, but no place of one is near a place of the other"
-    return match, f"{said}; {counted(len(match.pairs.partial), 'place is', 'places are')} the same"
+        return None, f"{aligned}, but no experience of one is near an experience of the other"
+    n = len(match.pairs.partial)
+    return match, f"{aligned}; {counted(n, 'experience is', 'experiences are')} the same"
 
 
-def outline_of(brain: "NavigationBrain") -> Outline:
-    """Return the feet of the walls that a brain remembers."""
-    walls = brain.navigation.walls.remembered()[0]
-    x, y, bearing, distance = (column.numpy(force=True) for column in walls[:4])
+def outline_of(x: Tensor, y: Tensor, bearing_rad: Tensor, distance_m: Tensor) -> Outline:
+    """Return the feet of walls that were remembered from points, ``(n,)`` each."""
+    x, y, bearing, distance = (
+        column.numpy(force=True) for column in (x, y, bearing_rad, distance_m)
+    )
     feet = np.column_stack([x + distance * np.cos(bearing), y + distance * np.sin(bearing)])
     return Outline(feet, bearing)
 
 
-def _places(loaded: "NavigationBrain", partial: "NavigationBrain", laid: Laid) -> Match | None:
-    """Pair the places that are nearer than two place cells of one map may be."""
-    poses = partial.map.poses
-    moved = Outline(poses[:, :2], poses[:, 2]).moved(laid.turn_rad, laid.move_m)
-    away, nearest = cKDTree(loaded.map.poses[:, :2]).query(moved.feet_m)
-    same = np.flatnonzero(away < partial.config.place_cells.threshold_m)
+def _same_experiences(
+    maps: tuple[np.ndarray, np.ndarray], alignment: OutlineAlignment, threshold_m: float
+) -> Match | None:
+    """Pair the experiences that are nearer than two place cells of one map may be."""
+    loaded, partial = maps
+    moved = Outline(partial[:, :2], partial[:, 2]).moved(alignment.turn_rad, alignment.move_m)
+    away, nearest = cKDTree(loaded[:, :2]).query(moved.feet_m)
+    same = np.flatnonzero(away < threshold_m)
     if not len(same):
         return None
-    turns = wrap_angles(moved.bearing_rad[same] - loaded.map.poses[nearest[same], 2])
+    turns = wrap_angles(moved.bearing_rad[same] - loaded[nearest[same], 2])
     pairs = Pairs(same, nearest[same], turns, away[same])
     best = int(np.argmin(away[same]))
     z = same[best]

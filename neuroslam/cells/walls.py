@@ -16,7 +16,7 @@ from torch import Tensor
 from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, wrap
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
-from neuroslam.state.population import Running, without_gradients
+from neuroslam.state.mergeable import BufferModule, without_gradients
 from neuroslam.state.tables import Scalars
 
 OWN = 4
@@ -34,7 +34,7 @@ _ALIKE_RAD = math.radians(25.0)
 _UNKNOWN_M2 = 1.0  # variance of a distance before it was measured
 
 
-class WallMemory(Running):
+class WallMemory(BufferModule):
     """Remembered walls of an animal, and its belief about its own errors.
 
     :func:`~neuroslam.cells.boundary_vectors.wall_innovation` has the geometry. The state is

@@ -4,10 +4,19 @@ import configparser
 import math
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from neuroslam.config.populations import known_kinds, population_class, section_class
 from neuroslam.config.sections import (
     BoundaryCellConfig,
     GridCellConfig,
@@ -23,16 +32,19 @@ from neuroslam.config.sections import (
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import ConfigError, did_you_mean
 
-CellKind = Literal["pose", "place", "semantic"]
-
 
 class BrainConfig(Section):
-    """Which cell populations a brain has, and every number in them.
+    """Which populations a brain is composed of, and every number in them.
+
+    A population that is not one of the three with sections below has its own section under its
+    kind: ``[head_direction]`` of a file, ``config.head_direction`` in Python.
 
     Example:
         >>> BrainConfig(view={"threshold": 0.04}).view.threshold
         0.04
     """
+
+    model_config = ConfigDict(extra="allow")  # sections of populations; any other key is refused
 
     odometry: OdometryConfig = OdometryConfig()
     view: ViewConfig = ViewConfig()
@@ -44,37 +56,93 @@ class BrainConfig(Section):
     place_cells: PlaceCellConfig = PlaceCellConfig()
     wall_memory: WallMemoryConfig = WallMemoryConfig()
     semantic: SemanticConfig = SemanticConfig()
-    cells: tuple[CellKind, ...] = Field(
-        ("pose",),
-        description="any of pose: views, pose cells and map (RatSLAM); place: boundary, grid and "
-        "place cells (SLRB); semantic: landmarks and their places (SSP-SLAM); as pose+place",
+    cells: tuple[str, ...] = Field(
+        default=("pose",),
+        description="populations; pose: views, pose cells and map (RatSLAM); place: boundary, grid "
+        "and place cells (SLRB); semantic: landmarks (SSP-SLAM); head_direction; speed; or one of "
+        "your own; as pose+place",
     )
-    frame_rate_hz: float = Field(20.0, gt=0, description="where the source has no times")
-    threads: int = Field(1, ge=1, description="of a run; for one brain, one is the fastest")
-    max_gap_s: float = Field(2.0, gt=0, description="a longer gap between frames is an error")
+    frame_rate_hz: float = Field(default=20.0, gt=0, description="where the source has no times")
+    threads: int = Field(
+        default=1, ge=1, description="of a run; for one brain, one is the fastest"
+    )
+    max_gap_s: float = Field(
+        default=2.0, gt=0, description="a longer gap between frames is an error"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_sections(cls, values: Any) -> Any:  # noqa: ANN401 - what a user gives
+        """Check the sections of populations by the classes that those have."""
+        if not isinstance(values, dict):
+            return values
+        checked, refused = dict(values), []
+        for key in values.keys() - cls.model_fields.keys():
+            section = section_class(key) if key in known_kinds() else None
+            if section is None:
+                refused.append(InitErrorDetails(type="extra_forbidden", loc=(key,), input=values[key]))
+            elif not isinstance(values[key], section):
+                try:
+                    checked[key] = section.model_validate(values[key])
+                except ValidationError as error:
+                    raise _inside(key, error) from None
+        if refused:
+            raise ValidationError.from_exception_data(cls.__name__, refused)
+        for kind in _kinds(values.get("cells", ())):
+            if kind not in checked and kind in known_kinds() and (section := section_class(kind)):
+                checked[kind] = section()
+        return checked
 
     @field_validator("cells", mode="before")
     @classmethod
-    def _told_as_text(cls, value: object) -> object:
-        if isinstance(value, str):  # pose_and_place: of files of earlier versions
-            value = value.replace("_and_", "+").split("+")
-        return value
+    def _from_text(cls, value: object) -> object:
+        return _kinds(value) if isinstance(value, str) else value
 
     @field_validator("cells")
     @classmethod
-    def _in_order(cls, value: tuple[CellKind, ...]) -> tuple[CellKind, ...]:
+    def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        known = known_kinds()
+        for kind in value:
+            if kind not in known:
+                population_class(kind)  # says which there are
         if not value or len(set(value)) < len(value):
-            raise ValueError("expected one or several of pose, place, semantic, each once")
-        return tuple(kind for kind in get_args(CellKind) if kind in value)
+            raise ValueError(
+                f"expected one or several of {', '.join(known)}, each once, joined by +"
+            )
+        return tuple(kind for kind in known if kind in value)
 
-    def has(self, kind: CellKind) -> bool:
-        """Say whether such cells are among the brain's.
+    def section(self, kind: str) -> Section:
+        """Return the section of a population that has its own.
 
         Example:
-            >>> BrainConfig(cells="pose+semantic").has("place")
-            False
+            >>> BrainConfig(cells="pose+speed").section("speed") == BrainConfig(cells="speed").speed
+            True
         """
-        return kind in self.cells
+        return getattr(self, kind)
+
+
+def _kinds(value: object) -> list[str]:
+    """Split ``pose+place``; ``pose_and_place`` is how files of earlier versions have it."""
+    if isinstance(value, str):
+        return value.replace("_and_", "+").split("+")
+    return list(value) if isinstance(value, list | tuple) else []
+
+
+def _inside(section: str, error: ValidationError) -> ValidationError:
+    """Name the section in the errors of its keys."""
+    lines = [
+        InitErrorDetails(
+            type=PydanticCustomError(line["type"], "{text}", {"text": line["msg"]}),
+            loc=(section, *line["loc"]),
+            input=line["input"],
+        )
+        if line["type"] not in ("extra_forbidden",)
+        else InitErrorDetails(
+            type=line["type"], loc=(section, *line["loc"]), input=line["input"]
+        )
+        for line in error.errors()
+    ]
+    return ValidationError.from_exception_data(error.title, lines)
 
 
 # OpenRatSLAM's name -> (section, our name), for the parameters that carry over one to one.

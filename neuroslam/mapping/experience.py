@@ -1,7 +1,6 @@
 """Experience map: a graph of places that odometry builds and relaxation makes consistent."""
 
 import math
-from typing import Literal
 
 import numpy as np
 import torch
@@ -22,7 +21,9 @@ from neuroslam.mapping.tables import (
     closes_loop,
     origin_key,
 )
-from neuroslam.state.population import Join, Population, State
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.population import Action, Correction
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
@@ -32,8 +33,6 @@ from neuroslam.types import (
     PoseEstimate,
     ViewMatch,
 )
-
-Action = Literal["none", "create", "link", "set"]
 
 
 def choose_action(
@@ -78,7 +77,7 @@ def choose_action(
     return ("none", current) if found == current else ("link", found)
 
 
-class ExperienceMap(Population):
+class ExperienceMap(Mergeable):
     """Graph of experiences (places with a view and a pose-cell state) and the links between them.
 
     The robot's pose is the pose of the current experience and the odometry accumulated since.
@@ -134,6 +133,11 @@ class ExperienceMap(Population):
     def current(self) -> int:
         """Id of the experience the robot is at, -1 before the first."""
         return self.state.current
+
+    @property
+    def pose_table(self) -> np.ndarray:
+        """Poses of all experiences, ``(n, 3)``; a view of the state, to read only."""
+        return self.experiences["pose"].numpy(force=True)
 
     @property
     def poses(self) -> np.ndarray:
@@ -237,19 +241,19 @@ class ExperienceMap(Population):
         action: Action = "none"
         self.state.since_s += elapsed_s
         self.state.time_s += elapsed_s
-        self.stand(pose)
+        self.set_pose(pose)
         if place not in (NO_EXPERIENCE, self.state.current):
             action = "create" if place == self.n else "link"
-            self.stand(at or pose)
+            self.set_pose(at or pose)
             if action == "create":
                 self.create(NO_TEMPLATE, PoseEstimate(0.0, 0.0, 0.0), frame)
             else:
                 self.link(place)
-            self.stand(pose)
+            self.set_pose(pose)
         self._drop_finished_goals()
         return action, self.state.current
 
-    def stand(self, pose: Pose) -> None:
+    def set_pose(self, pose: Pose) -> None:
         """Put the robot somewhere; it stays at the experience it is at."""
         s = self.state
         x = y = 0.0
@@ -263,6 +267,12 @@ class ExperienceMap(Population):
         s.dx_m += dx_m
         s.dy_m += dy_m
         s.facing_rad = wrap_angle(s.facing_rad + turn_rad)
+
+    def follow(self, correction: Correction) -> None:
+        """Move and turn the robot by what a population has corrected."""
+        if correction.moves:
+            dx, dy = correction.displacement(self.state.facing_rad)
+            self.nudge(dx, dy, correction.turn_rad)
 
     def move(self, motion: Motion) -> None:
         """Accumulate odometry: turn, then move along the new heading."""

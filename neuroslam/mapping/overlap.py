@@ -1,6 +1,6 @@
 """Which recognised places of two maps can be believed: those that agree on how the maps lie."""
 
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -8,32 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from neuroslam.geometry import wrap_angles
-
-
-class Pairs(NamedTuple):
-    """Places of a partial map that look like places of a loaded one; arrays of one length.
-
-    Attributes:
-        partial: Experience of the partial map.
-        loaded: Experience of the loaded map.
-        turn_rad: Heading of the first minus heading of the second, as seen.
-        error: How unlike they look: mean difference of the views, 0 is equal.
-    """
-
-    partial: np.ndarray
-    loaded: np.ndarray
-    turn_rad: np.ndarray
-    error: np.ndarray
-
-    @classmethod
-    def of(cls, rows: list[tuple[int, int, float, float]]) -> Self:
-        """Make them of a list of rows."""
-        table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-        return cls(*table[:, :2].T.astype(np.int64), *table[:, 2:].T)
-
-    def pick(self, which: np.ndarray) -> Self:
-        """Return some of them, by number or by truth."""
-        return type(self)(*(column[which] for column in self))
+from neuroslam.state.match import Pairs
 
 
 class Tolerance(NamedTuple):

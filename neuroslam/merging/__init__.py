@@ -1,1 +1,8 @@
-"""Merging: whether two maps meet, and how two states become one."""
+"""Merging: where two maps meet, whether that can be, and how two states become one."""
+
+from neuroslam.merging.match import Found, find_match, shared_history
+from neuroslam.merging.merge import Merged, merge
+from neuroslam.merging.report import MergeReport
+from neuroslam.state.match import Match
+
+__all__ = ["Found", "Match", "MergeReport", "Merged", "find_match", "merge", "shared_history"]

@@ -7,7 +7,8 @@ import numpy as np
 
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import Pairs, Tolerance, misfits_m
+from neuroslam.mapping.overlap import Tolerance, misfits_m
+from neuroslam.state.match import Pairs
 
 WINDOW = 3
 """A match of n places may have passed this many times n others: some views are missed."""

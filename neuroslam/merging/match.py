@@ -1,22 +1,18 @@
 """Where do two finished maps meet? Every view of each is looked for in the other."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.spiking.landmark_matching import match_landmarks
-from neuroslam.merging.limits import elsewhere, far_off, tolerance
-from neuroslam.merging.merge import Match, differing
-from neuroslam.state.sessions import session_name
-from neuroslam.cells.wall_matching import match_walls
 from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
 from neuroslam.mapping.tables import Origins, origin_key
+from neuroslam.merging.limits import elsewhere, far_off, tolerance
+from neuroslam.merging.mapped import Mapped, differing
+from neuroslam.state.match import Match, Pairs
+from neuroslam.state.sessions import session_name
 from neuroslam.types import NO_TEMPLATE
-
-if TYPE_CHECKING:
-    from neuroslam.brain.brain import NavigationBrain
 
 
 class Found(NamedTuple):
@@ -33,7 +29,7 @@ class Found(NamedTuple):
     groups: tuple[int, ...] = ()
 
 
-def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
+def find_match(loaded: Mapped, partial: Mapped) -> Found:
     """Look for the places that two maps share.
 
     Places that both have from a session they share are the same. Else each view of either map is
@@ -47,7 +43,7 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     apart = differing(loaded, partial)
     if apart:
         return Found(
-            None, f"views or pose cells were made with different configs: {'; '.join(apart)}"
+            None, f"views or cells were made with different configs: {'; '.join(apart)}"
         )
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:
@@ -55,10 +51,15 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     shared = shared_history(loaded, partial)
     if shared is not None:
         return shared
-    if partial.config.has("place") and not partial.config.has("pose"):
-        return Found(*match_walls(loaded, partial))
-    if not partial.config.has("pose"):
-        return Found(*match_landmarks(loaded, partial))
+    leader = partial.leader
+    if not leader.relaxes_map:
+        maps = loaded.map.poses, partial.map.poses
+        return Found(*leader.match(loaded.leader, maps, partial.config))
+    return _match_views(loaded, partial)
+
+
+def _match_views(loaded: Mapped, partial: Mapped) -> Found:
+    """Look every view of either map up in the other, and keep those that agree."""
     pairs, best = _alike(loaded, partial)
     threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
     if not len(pairs.partial):
@@ -94,7 +95,7 @@ def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
     )
 
 
-def _alike(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Pairs, float | None]:
+def _alike(loaded: Mapped, partial: Mapped) -> tuple[Pairs, float | None]:
     """Pairs of places whose views match, looked for both ways, and the smallest difference met."""
     seen: dict[tuple[int, int], tuple[float, float]] = {}
     best: float | None = None
@@ -125,14 +126,14 @@ def _alike(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Pairs
     return Pairs.of(sorted(rows)), best
 
 
-def _places_of_views(brain: "NavigationBrain") -> dict[int, list[int]]:
+def _places_of_views(brain: Mapped) -> dict[int, list[int]]:
     places: dict[int, list[int]] = {}
     for experience, view in enumerate(brain.map.experiences["template"].tolist()):
         places.setdefault(view, []).append(experience)
     return places
 
 
-def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found | None:
+def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
     """Find the places that two maps have from one session; ``None`` if they share no session.
 
     Args:
@@ -175,7 +176,7 @@ def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Fou
     )
 
 
-def _pixels(brain: "NavigationBrain", places: np.ndarray) -> np.ndarray:
+def _pixels(brain: Mapped, places: np.ndarray) -> np.ndarray:
     """Return the views of places, one row each; of what has none, a row that is equal to all."""
     views = brain.map.experiences["template"].numpy()[places]
     if not brain.view.n:
@@ -211,7 +212,7 @@ def _fits(
 
 
 def _runner_up(
-    loaded: "NavigationBrain", partial: "NavigationBrain", pairs: Pairs, at: int, limits: Tolerance
+    loaded: Mapped, partial: Mapped, pairs: Pairs, at: int, limits: Tolerance
 ) -> float | None:
     """Smallest difference of the matched view to any view of places elsewhere."""
     templates = loaded.map.experiences["template"].numpy()

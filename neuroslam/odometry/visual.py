@@ -5,6 +5,7 @@ Turning to the left moves the picture to the right: see ``docs/sign_conventions.
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from neuroslam.config.sections import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
 
@@ -115,7 +116,16 @@ def motion_from_match(
     return Velocity(v if v >= config.min_speed_m_s else 0.0, w_deg_s * math.pi / 180.0)
 
 
-class VisualOdometry(Running):
+class Profiles(NamedTuple):
+    """Size of a picture in px, and the column sums of its speed and turn region."""
+
+    height: int
+    width: int
+    speed: np.ndarray
+    turn: np.ndarray
+
+
+class VisualOdometry(AboutNow):
     """Measures motion by matching each picture with the one before it.
 
     The column sums of the last picture's two regions are buffers, so ``state_dict`` is complete.
@@ -152,6 +162,12 @@ class VisualOdometry(Running):
             ConfigError: If a region does not lie in the picture, or is too narrow for the offsets.
             BadFrame: If the picture is not of the size and kind of those before, or no time passed.
         """
+        velocity, profiles = self.measure(image, dt_s)
+        self.remember(profiles)
+        return velocity
+
+    def measure(self, image: np.ndarray, dt_s: float) -> tuple[Velocity, Profiles]:
+        """Compare a picture with the one before it; nothing changes. See :meth:`forward`."""
         if not dt_s > 0.0:
             raise BadFrame(f"VisualOdometry: {dt_s} s since the last picture; expected more than 0")
         if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
@@ -171,25 +187,27 @@ class VisualOdometry(Running):
         if self._regions is None:
             self._regions = regions_in(height, width, self.config)
         speed_region, turn_region = self._regions
-        speed_sums = column_sums(image, speed_region)
-        turn_sums = column_sums(image, turn_region)
+        now = Profiles(
+            height, width, column_sums(image, speed_region), column_sums(image, turn_region)
+        )
         if first and self.config.first_frame == "still":
-            velocity = Velocity(0.0, 0.0)
-        else:
-            speed_before = np.zeros_like(speed_sums) if first else self.speed_sums.cpu().numpy()
-            turn_before = np.zeros_like(turn_sums) if first else self.turn_sums.cpu().numpy()
-            max_shift = self.config.max_shift_px
-            shift, _ = match_profiles(turn_sums, turn_before, max_shift)
-            _, difference = match_profiles(speed_sums, speed_before, max_shift)
-            difference /= 255.0 * (speed_region[3] - speed_region[2])
-            velocity = motion_from_match(shift, difference, width, dt_s, self.config)
-        if first:
-            self.size.height, self.size.width = height, width
+            return Velocity(0.0, 0.0), now
+        speed_before = np.zeros_like(now.speed) if first else self.speed_sums.cpu().numpy()
+        turn_before = np.zeros_like(now.turn) if first else self.turn_sums.cpu().numpy()
+        max_shift = self.config.max_shift_px
+        shift, _ = match_profiles(now.turn, turn_before, max_shift)
+        _, difference = match_profiles(now.speed, speed_before, max_shift)
+        difference /= 255.0 * (speed_region[3] - speed_region[2])
+        return motion_from_match(shift, difference, width, dt_s, self.config), now
+
+    def remember(self, profiles: Profiles) -> None:
+        """Keep the profiles of a picture for the comparison with the next."""
+        if self.size.height == 0:
+            self.size.height, self.size.width = profiles.height, profiles.width
         # By way of _buffers: setting an attribute of a module costs more than matching a profile.
         device = self.speed_sums.device
-        self._buffers["speed_sums"] = torch.from_numpy(speed_sums).to(device)
-        self._buffers["turn_sums"] = torch.from_numpy(turn_sums).to(device)
-        return velocity
+        self._buffers["speed_sums"] = torch.from_numpy(profiles.speed).to(device)
+        self._buffers["turn_sums"] = torch.from_numpy(profiles.turn).to(device)
 
 
 def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region, Region]:

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import BaseModel
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.merging.merge import MergeReport
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
+from neuroslam.merging.merge import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS, odometry_track, places_of, trajectory, true_poses
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
-from neuroslam.state.sessions import session_name
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file, track_file
 from neuroslam.spiking.export import export_nir
+from neuroslam.state.sessions import session_name
 from neuroslam.state.tables import write_atomically
 
 

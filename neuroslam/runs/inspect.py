@@ -17,7 +17,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint
-from neuroslam.state.sessions import Session, session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import NeuroslamError, counted
 from neuroslam.evaluation.trajectory import read_tum
@@ -36,7 +35,8 @@ from neuroslam.runs.files import (
     read_trace,
     trajectory,
 )
-from neuroslam.state.population import State
+from neuroslam.state.mergeable import State
+from neuroslam.state.sessions import Session, session_name
 from neuroslam.state.tables import GrowingTable
 
 _SUM_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.errors import RunError
 from neuroslam.merging.match import find_match
 from neuroslam.merging.merge import MergeReport, merge
-from neuroslam.errors import RunError
 from neuroslam.runs.files import (
     FRAME_COLUMNS,
     LANDMARKS_FILE,

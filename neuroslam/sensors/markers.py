@@ -59,6 +59,10 @@ class MarkerDetector:
         if not panoramic and not fov_deg < 180.0:
             raise SourceError(f"markers: a view of {fov_deg:g} degrees is no pinhole's; below 180")
 
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out OpenCV's detector, which cannot be copied; it is made again when needed."""
+        return {name: value for name, value in self.__dict__.items() if name != "_detector"}
+
     @cached_property
     def _detector(self) -> "cv2.aruco.ArucoDetector":
         parameters = cv2.aruco.DetectorParameters()

@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig
 from neuroslam.spiking.path_integrator import Packet, coupled
 from neuroslam.spiking.space import SSPSpace
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 
 class AlgebraicIntegrator(Packet):
@@ -88,7 +88,7 @@ class AlgebraicIntegrator(Packet):
         return self.locate(velocity_m_s)
 
 
-class AlgebraicMap(Running):
+class AlgebraicMap(BufferModule):
     r"""Learns which vector belongs to which key, as one matrix and by the delta rule.
 
     .. math:: W \leftarrow W + \kappa\,\Delta t\,(v - W k)\, k^\top / |k|^2

@@ -14,7 +14,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.learning import pes_step, voja_step
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
 _TAU_RECALL_S = 0.005
@@ -23,7 +23,7 @@ _TAU_TEACHER_S = 0.05
 _INHIBITION = 25.0  # of the error's neurons, where nothing is to be learnt
 
 
-class AssociativeMap(Running):
+class AssociativeMap(BufferModule):
     """Learns which vector belongs to which key: places of landmarks, by their pointers.
 
     A population fires to keys; the weights with which it recalls learn from the error

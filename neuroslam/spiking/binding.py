@@ -13,14 +13,14 @@ from neuroslam.spiking.ensemble import (
     solve_decoders,
     synapse,
 )
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 1000
 _RADIUS = math.sqrt(2.0)  # of a sum or difference of two numbers of at most 1, over root 2
 TAU_S = 0.03  # noise of few neurons; who compares with it waits as long
 
 
-class SpikingBinding(Running):
+class SpikingBinding(BufferModule):
     r"""Multiplies Fourier coefficients with populations that square numbers.
 
     .. math:: ab = \tfrac12 \Bigl[\Bigl(\tfrac{a+b}{\sqrt2}\Bigr)^2 -

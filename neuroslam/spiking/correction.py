@@ -12,7 +12,7 @@ from neuroslam.spiking.ensemble import (
     solve_decoders,
     synapse,
 )
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
 _VETO_NEURONS = 50
@@ -21,7 +21,7 @@ _TAU_S = 0.05
 _OUT_S = 0.1  # noise of few neurons stays out of the path integrator
 
 
-class SpikingCorrection(Running):
+class SpikingCorrection(BufferModule):
     r"""Says by how much the map disagrees, unless a population objects.
 
     One population holds the difference of two vectors; another fires where their similarity is

@@ -16,7 +16,7 @@ from neuroslam.spiking.neurons import (
     stepped_lif,
     stepped_lif_rate,
 )
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 
 class Tuning(NamedTuple):
@@ -138,7 +138,7 @@ def lowpass(filtered: Tensor, value: Tensor, kept: float) -> Tensor:
     return torch.lerp(value, filtered, kept)
 
 
-class NeuronArray(Running):
+class NeuronArray(BufferModule):
     """Populations of the same size, side by side: currents in, spikes out.
 
     :func:`neuroslam.spiking.neurons.lif_step` has the mathematics. Groups lead and animals come

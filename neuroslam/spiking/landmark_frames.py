@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED
-from neuroslam.state.population import State
+from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
 
 

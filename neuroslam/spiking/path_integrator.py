@@ -16,7 +16,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.space import SSPSpace
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
@@ -95,7 +95,7 @@ def coupled(
     return inner if pull is None else pull + inner
 
 
-class Packet(Running):
+class Packet(BufferModule):
     """What both kinds of path integrator share: where the packet of their phases is.
 
     State: ``position_m`` ``(batch, dimension)``, ``age`` in steps, and the space's parameters.

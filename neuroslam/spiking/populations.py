@@ -12,14 +12,14 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.space import SSPSpace
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
 TAU_S = 0.01
 _INTERCEPTS = (0.1, 0.9)  # similarity to its own place at which a cell begins to fire
 
 
-class VectorPopulation(Running):
+class VectorPopulation(BufferModule):
     r"""Says an SSP with cells that each like one: ``φ(p)``, or the part of it that a module has.
 
     .. math:: J_i = \alpha_i\, e_i \cdot \phi + \beta_i

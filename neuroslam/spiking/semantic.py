@@ -1,22 +1,45 @@
 """The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
 
 import math
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.config import BrainConfig
 from neuroslam.config.semantic import SemanticConfig
-from neuroslam.errors import MapError
+from neuroslam.errors import MapError, listed
 from neuroslam.geometry import wrap_angle
+from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.spiking.decoding import PositionDecoder
-from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated
-from neuroslam.spiking.sightings import LEAST_SEEN, NAMED, NAMELESS, VIEW, Guide, Sightings, Told
+from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated, shared_frames
+from neuroslam.spiking.landmark_matching import match_landmarks
+from neuroslam.spiking.sightings import (
+    LEAST_SEEN,
+    NAMED,
+    NAMELESS,
+    VIEW,
+    LandmarkUpdate,
+    Sightings,
+)
 from neuroslam.spiking.slam import SSPSLAM
-from neuroslam.state.population import Join, Population, State, without_gradients
+from neuroslam.state.join import Join
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import State, without_gradients
+from neuroslam.state.population import (
+    Belief,
+    Correction,
+    Decision,
+    LeadableMap,
+    Observation,
+    Population,
+    StepInput,
+)
+from neuroslam.state.registry import register
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import Motion, Pose
+from neuroslam.types import NO_TEMPLATE, Frame, Motion, Pose, PoseEstimate
 from neuroslam.worlds.landmarks import LandmarkView
 
 _KINDS = ("landmark", "view", "nameless")
@@ -28,6 +51,7 @@ _MOVED_M = 0.05  # by which a landmark moves with its experience before memory i
 _NEAR_M = 0.5  # nearer landmarks say nothing of the heading
 
 
+@register("semantic")
 class SemanticCells(Population):
     r"""Learns where landmarks are, as vectors, and is corrected by those that it knows.
 
@@ -50,10 +74,26 @@ class SemanticCells(Population):
         >>> cells = SemanticCells(SemanticConfig())
         >>> door = Sightings.of(np.array([[7.0, 2.0, 0.0]]))
         >>> for _ in range(20):
-        ...     told = cells.live(Motion(0.0, 0.0, 0.1), door)
+        ...     told = cells.advance(Motion(0.0, 0.0, 0.1), door)
         >>> cells.landmarks()["place_m"].round(1).tolist() == [[2, 0]]
         True
     """
+
+    merge_sections = ("semantic",)
+    rank = 1
+    compass = "uses"
+
+    @classmethod
+    def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
+        """Make the semantic cells of a brain."""
+        follows = "nothing" if leader is cls else "map" if leader.relaxes_map else "cells"
+        cells = cls(config.semantic, math.radians(config.map.initial_heading_deg), follows)
+        if "markers" in config.semantic.landmarks:
+            c = config.semantic
+            cells.detector = MarkerDetector(
+                c.markers, c.marker_size_m, config.odometry.fov_deg, config.view.panoramic
+            )
+        return cells
 
     def __init__(
         self,
@@ -64,6 +104,8 @@ class SemanticCells(Population):
         super().__init__()
         self.config = config
         self.follows = follows
+        self.detector: MarkerDetector | None = None  # of landmarks in pictures
+        self._update: LandmarkUpdate | None = None  # of the last frame
         self.known = GrowingTable(
             {
                 "kind": ((), torch.int64),
@@ -112,74 +154,202 @@ class SemanticCells(Population):
         both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
         return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
 
+    def observe(self, frame: Frame) -> Sightings:
+        """Return the landmarks in sight: those that the source gives, and markers in the picture.
+
+        Raises:
+            BadFrame: If they cannot be that.
+        """
+        tables = []
+        if "given" in self.config.landmarks and frame.landmarks is not None:
+            tables.append(frame.landmarks)
+        if self.detector is not None and frame.image is not None:
+            tables.append(self.detector(frame.image))
+        return Sightings.of(*tables)
+
+    def check(self, now: StepInput, observation: Observation, belief: Belief | None) -> None:
+        """Refuse a frame that would take the robot out of the space of the vectors.
+
+        Raises:
+            MapError: If so.
+        """
+        start = self.pose if belief is None else belief.pose
+        heading = now.compass_rad if belief is None else None
+        self._stay_inside(self._dead_reckoned(start, now.motion, heading)[:2])
+
+    @staticmethod
+    def _dead_reckoned(start: Pose, motion: Motion, compass_rad: float | None) -> Pose:
+        heading = compass_rad
+        if heading is None:
+            heading = wrap_angle(start.theta_rad + motion.w_rad_s * motion.dt_s)
+        length = motion.v_m_s * motion.dt_s
+        return Pose(
+            start.x_m + length * math.cos(heading), start.y_m + length * math.sin(heading), heading
+        )
+
+    def recall(
+        self, now: StepInput, observation: Sightings, belief: Belief | None
+    ) -> Correction | None:
+        """Learn the landmarks in sight, and tell where known ones put the robot.
+
+        A map whose relaxation has moved the robot out of the space is not corrected; the next frame
+        is refused.
+        """
+        self._update = None
+        if belief is not None and not self._is_inside(belief.pose[:2]):
+            return None
+        landmarks = observation
+        if "views" in self.config.landmarks and now.view.template != NO_TEMPLATE:
+            landmarks = landmarks.with_view(now.view.template)
+        if belief is not None and self.follows == "map":
+            self.follow_map(belief.poses)
+        update = self.advance(
+            now.motion, landmarks, compass_rad=now.compass_rad, belief=belief, frame=now.frame
+        )
+        self._update = update
+        heading = self.now.heading_rad if belief is None else belief.pose.theta_rad
+        return Correction(
+            *update.correction_m,
+            update.turn_rad,
+            heading,
+            update.place_m,
+            self.config.sigma_m,
+            update.variance_m2,
+            update.lost,
+        )
+
+    @property
+    def estimate(self) -> PoseEstimate:
+        """Position in metres, as ``frames.csv`` has it of a brain without pose cells."""
+        x, y, _ = self.pose
+        return PoseEstimate(x, y, 0.0)
+
+    @property
+    def lost(self) -> bool:
+        """Whether a known landmark has just put the robot where it was not believed to be."""
+        return self._update is not None and self._update.lost
+
+    def belief(self, map_: LeadableMap) -> Belief:
+        """Return the pose of the cells."""
+        return Belief(self.pose)
+
+    def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
+        """Go to the experience of the landmark that is attended to; each landmark is one."""
+        row = -1 if self._update is None else self._update.landmark
+        experience, at = self.experience_of(row, map_.n)
+        return Decision(*map_.visit(experience, self.pose, now.motion.dt_s, now.frame, at))
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Real, then imaginary part of each oscillator of the path integrator."""
+        z = self.slam.integrator.z.flatten().numpy(force=True)
+        return np.concatenate([z.real, z.imag])
+
+    def counts(self) -> dict[str, float]:
+        """Return the number of landmarks that count."""
+        return {"landmarks": self.n}
+
+    def scalars(self) -> dict[str, float]:
+        """Return what TensorBoard shows."""
+        return {
+            "semantic/landmarks": float(self.n),
+            "semantic/contradicted_s": float(self.slam.contradicted_s[0]),
+        }
+
+    def tables(self) -> dict[str, str]:
+        """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience."""
+        known = self.landmarks()
+        columns = ("name", "place_m", "seen", "first_frame", "experience")
+        rows = zip(*(known[column].tolist() for column in columns), strict=True)
+        lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e in rows]
+        return {"landmarks.csv": "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines, ""])}
+
+    def points_m(self) -> np.ndarray:
+        """Return where landmarks are on the map, ``(n, 2)``, views left out."""
+        known = self.landmarks()
+        return known["place_m"][known["kind"] != VIEW]
+
+    @classmethod
+    def faults(
+        cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
+    ) -> Iterator[str]:
+        """Say where pointers are missing, or landmarks were met at experiences that are not."""
+        pointers, kinds = len(state["slam.pointers"]), len(state["known.kind"])
+        if pointers != max(1, kinds):
+            yield f"{kinds} landmarks, {pointers} pointers; each should have its own"
+        at = state["known.experience"]
+        rows = np.flatnonzero((at < -1) | (at >= n_experiences))
+        if len(rows):
+            yield (
+                f"landmarks {listed(rows)}: met at experiences {listed(at[rows])}, "
+                f"there are {n_experiences}"
+            )
+
     @without_gradients
-    def live(
+    def advance(
         self,
         motion: Motion,
         seen: Sightings,
         *,
         compass_rad: float | None = None,
-        guide: Guide | None = None,
+        belief: Belief | None = None,
         frame: int = 0,
-    ) -> Told:
-        """Take in a frame.
+    ) -> LandmarkUpdate:
+        """Advance by a frame.
 
         Args:
             motion: Since the last frame.
             seen: Landmarks in sight at its end.
             compass_rad: Measured heading; ``None``: it is integrated.
-            guide: Where a map or other cells say that the robot is; ``None``: it is alone.
+            belief: Where a map or other cells say that the robot is; ``None``: it is alone.
             frame: Number of the frame.
 
         Raises:
             MapError: If the robot leaves the space; nothing has changed then.
         """
         now, before = self.now, self.pose
-        if guide is None:
-            heading = compass_rad
-            if heading is None:
-                heading = wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
-            way = motion.v_m_s * motion.dt_s
-            step = way * math.cos(heading), way * math.sin(heading)
-            here = before.x_m + step[0], before.y_m + step[1]
+        if belief is None:
+            *here, heading = self._dead_reckoned(before, motion, compass_rad)
+            length = motion.v_m_s * motion.dt_s
+            step = length * math.cos(heading), length * math.sin(heading)
         else:
-            *here, heading = guide.pose
+            *here, heading = belief.pose
             step = here[0] - before.x_m, here[1] - before.y_m
         self._stay_inside(here)
         now.heading_rad, now.frame = heading, frame
-        if guide is not None and math.hypot(*step) > float(self.slam.space.length_scale_m.min()):
+        if belief is not None and math.hypot(*step) > float(self.slam.space.length_scale_m.min()):
             self.slam.start(torch.tensor([here]))  # others have jumped
             step = (0.0, 0.0)
         angle = seen.bearing_rad + heading
         vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * seen.distance_m[:, None]
         places = np.array(here) + vectors
-        rows, fresh = self._name(seen, places, guide)
+        rows, fresh = self._name(seen, places, belief)
         good = self._agreeing(rows, fresh, places)
         rows, vectors, kind = rows[good], vectors[good], seen.kind[good]
         attended, strength, gate, lost = self._steps(motion.dt_s, step, rows, vectors)
         if attended < 0:
             now.told = -1
-            return Told((0.0, 0.0), 0.0, None, 0.0, -1, False, False)
+            return LandmarkUpdate((0.0, 0.0), 0.0, None, 0.0, -1, False, False)
         vector = vectors[rows == attended][0]
         if strength > _KNOWN:
-            self._note_place(attended, guide, np.array(here) + vector)
+            self._note_place(attended, belief, np.array(here) + vector)
         place = None
         if bool(self.slam.familiar[0]) and (now.told != attended or lost):
             now.told = attended
             place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
         lost = lost and self._is_inside(place)
         if lost:  # its landmarks contradict for long: it was carried, or has drifted far
-            self.go_to(place)
+            self.relocalise(place)
         correction, turn = (0.0, 0.0), 0.0
         if self.follows != "cells":
-            if guide is None or gate > 0.5 or lost:
+            if belief is None or gate > 0.5 or lost:
                 after = self.pose
                 correction = after.x_m - here[0], after.y_m - here[1]
             if compass_rad is None:
                 turn = self._turn(motion.dt_s, rows, vectors, kind)
         sure = float(self.known["variance_m2"][attended])
         new = bool(fresh[good][rows == attended].any())
-        return Told(correction, turn, place, sure, attended, new, lost)
+        return LandmarkUpdate(correction, turn, place, sure, attended, new, lost)
 
     @without_gradients
     def follow_map(self, poses: np.ndarray) -> bool:
@@ -211,7 +381,7 @@ class SemanticCells(Population):
         if slam.places is not None:
             slam.places.write(places, slam.pointers)
 
-    def place_of(self, row: int, n: int) -> tuple[int, Pose | None]:
+    def experience_of(self, row: int, n: int) -> tuple[int, Pose | None]:
         """Return the place of a map that a landmark is, and where; each is one, where it is alone.
 
         Args:
@@ -225,7 +395,7 @@ class SemanticCells(Population):
         x, y = self.known["place_m"][row].tolist()
         return int(self.known["experience"][row]), Pose(x, y, self.now.heading_rad)
 
-    def go_to(self, place_m: tuple[float, float]) -> None:
+    def relocalise(self, place_m: tuple[float, float]) -> None:
         """Put the animal somewhere; what it has learnt stays."""
         self._stay_inside(place_m)
         self.slam.start(torch.tensor([place_m]))
@@ -242,7 +412,7 @@ class SemanticCells(Population):
         return all(a <= x <= b for a, x, b in zip(low, place_m, high, strict=True))
 
     def _name(
-        self, seen: Sightings, places_m: np.ndarray, guide: Guide | None
+        self, seen: Sightings, places_m: np.ndarray, belief: Belief | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Say which row each landmark in sight has, -1 for none, and which rows are new."""
         rows = np.full(len(seen.kind), -1)
@@ -254,7 +424,7 @@ class SemanticCells(Population):
             else:
                 rows[i] = self._rows.get((kind, number), -1)
             if rows[i] < 0 and number >= 0:
-                rows[i], fresh[i] = self._meet(kind, number, places_m[i], guide), True
+                rows[i], fresh[i] = self._meet(kind, number, places_m[i], belief), True
             if rows[i] >= 0:
                 self.known["seen"][rows[i]] += 1
         return rows, fresh
@@ -274,17 +444,17 @@ class SemanticCells(Population):
             return -1, -1
         return int(mine[order[0]]), 0
 
-    def _meet(self, kind: int, number: int, place_m: np.ndarray, guide: Guide | None) -> int:
+    def _meet(self, kind: int, number: int, place_m: np.ndarray, belief: Belief | None) -> int:
         """Take a landmark into the vocabulary."""
         experience, offset = -1, np.zeros(2)
-        if guide is not None and guide.experience >= 0:  # on a map that is relaxed
-            experience, offset = guide.experience, into_frame(guide.at, place_m)
+        if belief is not None and belief.experience >= 0:  # on a map that is relaxed
+            experience, offset = belief.experience, into_frame(belief.at, place_m)
         row = self.known.append(
             kind=kind,
             number=number,
             place_m=torch.from_numpy(place_m),
             seen=0,
-            variance_m2=0.0 if guide is None else guide.variance_m2,
+            variance_m2=0.0 if belief is None else belief.variance_m2,
             first_frame=self.now.frame,
             experience=experience,
             offset_m=torch.from_numpy(offset),
@@ -339,7 +509,7 @@ class SemanticCells(Population):
         )
         return attended, recall, gate, lost and bool(slam.familiar[0])
 
-    def _note_place(self, row: int, guide: Guide | None, seen_m: np.ndarray) -> None:
+    def _note_place(self, row: int, belief: Belief | None, seen_m: np.ndarray) -> None:
         """Read out where the landmark is that is recalled."""
         recalled = torch.view_as_complex(self.slam.recalled)
         start = self.known["place_m"][row][None].to(recalled.real)
@@ -354,7 +524,7 @@ class SemanticCells(Population):
         place = place[0].double()
         anchor = int(self.known["experience"][row])
         if anchor >= 0 and self.follows == "map":
-            at = guide.poses[anchor]
+            at = belief.poses[anchor]
             self.known["offset_m"][row] = torch.from_numpy(into_frame(at, place.numpy()))
         self.known["place_m"][row] = place
 
@@ -419,6 +589,22 @@ class SemanticCells(Population):
             columns["seen"][at] += theirs["seen"]
             columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
         return self._written(other, columns, join)
+
+    def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
+        """Say how two maps of landmarks alone lie by those that both know by name."""
+        if self.follows != "nothing":
+            return None
+        return shared_frames(loaded, partial, same_m=self.config.same_m)
+
+    def match(
+        self, loaded: Population, maps: tuple[np.ndarray, np.ndarray], config: BrainConfig
+    ) -> tuple[Match | None, str]:
+        """Align the landmarks that two sessions know by name."""
+        if not isinstance(loaded, SemanticCells):
+            raise TypeError(f"SemanticCells: cannot be matched with {type(loaded).__name__}")
+        states = loaded.state_dict(), self.state_dict()
+        known = loaded.landmarks(), self.landmarks()
+        return match_landmarks(states, known, maps, config)
 
     def _moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
         """Bring positions of the partial session, ``(n, 2)``, into the loaded one's frame."""

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 
 from neuroslam.errors import BadFrame
-from neuroslam.types import Pose
 
 NAMED, VIEW, NAMELESS = 0, 1, 2
 """Kinds of landmarks: with a number of its own, a known view, told apart by place alone."""
@@ -64,28 +63,7 @@ class Sightings(NamedTuple):
         return Sightings(*(np.append(column, x) for column, x in zip(self, row, strict=True)))
 
 
-class Guide(NamedTuple):
-    """Where a map or other cells say that the robot is.
-
-    Attributes:
-        pose: Of the robot.
-        variance_m2: How sure that is.
-        experience: That the robot is at, on a map that is relaxed; -1: there is none.
-        poses: Of all experiences, ``(n, 3)``.
-    """
-
-    pose: Pose
-    variance_m2: float = 0.0
-    experience: int = -1
-    poses: np.ndarray = np.empty((0, 3))
-
-    @property
-    def at(self) -> np.ndarray:
-        """Pose of the experience that the robot is at, ``(3,)``."""
-        return self.poses[self.experience]
-
-
-class Told(NamedTuple):
+class LandmarkUpdate(NamedTuple):
     """What the semantic cells say after a frame.
 
     Attributes:

@@ -21,7 +21,7 @@ from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.quantise import quantised
 from neuroslam.spiking.space import SSPSpace
-from neuroslam.state.population import Running
+from neuroslam.state.mergeable import BufferModule
 from neuroslam.worlds.landmarks import LandmarkView
 
 _CHUNK = 200  # steps whose inputs are prepared at once
@@ -56,7 +56,7 @@ class SSPStep(NamedTuple):
     attended: Tensor
 
 
-class SSPSLAM(Running):
+class SSPSLAM(BufferModule):
     r"""Localises an animal and maps landmarks, semantically, in one of three tiers.
 
     .. math:: \hat\phi(x_i) = \hat\phi(x) \circledast \phi(x_i - x), \qquad

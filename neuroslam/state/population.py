@@ -1,189 +1,337 @@
-"""What every part of a brain must say: how its states from two sessions become one."""
+"""The protocol by which a brain is composed of populations of cells.
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from functools import wraps
-from typing import NamedTuple, ParamSpec, TypeVar
+A frame passes through a population in this order: ``observe`` and ``check`` (nothing changes, the
+frame may be refused), ``step`` (self-motion and the population's own senses), ``vetoes`` (before
+the map closes a loop), ``follow`` (what others correct), ``learn`` and ``recall`` (its memory). One
+population leads: it decides which experience of the map the robot is at.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
-import torch
-from torch import Tensor, nn
 
-from neuroslam.geometry import wrap_angle, wrap_angles
-from neuroslam.types import Pose
+from neuroslam.config import BrainConfig, Section
+from neuroslam.geometry import rotate
+from neuroslam.state.join import Join, MovedCells
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import Mergeable, Rule, State, merge_by_rules
+from neuroslam.types import Frame, Motion, Pose, PoseEstimate, ViewMatch
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-State = dict[str, Tensor]
-"""A ``state_dict``, or the part of one that belongs to a population, without its prefix."""
+Action = Literal["none", "create", "link", "set"]
+Observation = Any
+"""What a population finds in a frame: arrays, numbers or a tuple of them; ``None``: nothing."""
 
 
-class Join(NamedTuple):
-    """How ids and coordinates of a partial map become those of the map it is merged into.
+class StepInput(NamedTuple):
+    """What every population gets of a frame.
 
     Attributes:
-        views: Partial view id -> merged view id, ``(n_views,)``.
-        experiences: Partial experience id -> merged experience id, ``(n_experiences,)``.
-        view_turns_rad: Heading with which a partial view was learnt, minus that of the merged
-            view, ``(n_views,)``; 0 where the view is kept.
-        turns_rad: The same of the partial experiences' headings, ``(n_experiences,)``.
-        n_views: Views of the loaded map: kept partial views follow them.
-        n_experiences: Experiences of the loaded map.
-        torus: ``(n_x, n_y, n_theta)`` of the pose cells.
-        cell_shift: By how many cells the activity moves along x, y and theta.
-        view_cells: Where partial views are bound then, x, y, theta in cells, ``(n_views, 3)``.
-        experience_cells: The same of the partial experiences, ``(n_experiences, 3)``.
-        pivot: Pose of the matched experience in the partial map.
-        onto: Pose that it takes in the merged map.
-        cells: The same two poses in the frames of cells that keep positions themselves, where
-            those are not the maps'.
+        frame: Number of the frame.
+        motion: Self-motion since the last frame.
+        view: View that the frame shows; template -1 where the brain has no views, or shows none.
+        compass_rad: Heading by a compass; ``None``: it has none.
+        vetoed: A population contradicts that the robot is where the view was learnt.
     """
 
-    views: np.ndarray
-    experiences: np.ndarray
-    view_turns_rad: np.ndarray
-    turns_rad: np.ndarray
-    n_views: int
-    n_experiences: int
-    torus: tuple[int, int, int]
-    cell_shift: tuple[float, float, float]
-    view_cells: np.ndarray
-    experience_cells: np.ndarray
-    pivot: Pose
-    onto: Pose
-    cells: tuple[Pose, Pose] | None = None
+    frame: int
+    motion: Motion
+    view: ViewMatch
+    compass_rad: float | None = None
+    vetoed: bool = False
 
-    @property
-    def rotation_rad(self) -> float:
-        """By how much the partial map turns."""
-        return wrap_angle(self.onto.theta_rad - self.pivot.theta_rad)
 
-    @property
-    def kept_views(self) -> np.ndarray:
-        """Ids of the partial views that are new in the merged map, in order."""
-        return np.flatnonzero(self.views >= self.n_views)
+class Correction(NamedTuple):
+    r"""By how much a population corrects where the robot is believed to be.
 
-    @property
-    def kept_experiences(self) -> np.ndarray:
-        """Ids of the partial experiences that are new in the merged map, in order."""
-        return np.flatnonzero(self.experiences >= self.n_experiences)
+    Every population may keep a frame of its own: a follower whose heading is :math:`\theta_f` moves
+    by :math:`R(\theta_f - \theta_a)\,d`, with :math:`\theta_a` the author's heading.
 
-    def place(self, poses: np.ndarray) -> np.ndarray:
-        r"""Move partial poses into the loaded map; the pivot comes to lie exactly ``onto``.
+    Attributes:
+        dx_m: Displacement :math:`d` along x in the author's frame.
+        dy_m: And along y.
+        turn_rad: Turn of the heading, counter-clockwise.
+        heading_rad: Heading of the robot in the author's frame, :math:`\theta_a`.
+        position_m: Where the robot is in the leader's frame, where that is known absolutely.
+        sigma_m: Standard deviation of that position.
+        variance_m2: Variance of the robot's position when the author learnt what it recalls.
+        relocalises: The robot was kidnapped or lost: followers go there at once.
+    """
 
-        .. math:: x' = R(\Delta\theta)\,(x - x_z) + x_u, \quad
-                  \theta' = (\theta - \theta_z) + \theta_u
+    dx_m: float = 0.0
+    dy_m: float = 0.0
+    turn_rad: float = 0.0
+    heading_rad: float = 0.0
+    position_m: tuple[float, float] | None = None
+    sigma_m: float = 0.0
+    variance_m2: float = 0.0
+    relocalises: bool = False
 
-        (Multisession RatSLAM, Eqs. 13 and 14; Eq. 14 is misprinted there, this is what its
-        program does.)
-
-        Args:
-            poses: x, y in metres and heading in radians, ``(n, 3)``.
+    def displacement(self, heading_rad: float) -> tuple[float, float]:
+        """Return the displacement in the frame of a follower that has this heading.
 
         Example:
-            >>> none, torus = np.empty(0, dtype=np.int64), (9, 9, 9)
-            >>> pivot, onto = Pose(1.0, 0.0, 0.0), Pose(5.0, 5.0, np.pi / 2)
-            >>> join = Join(*[none] * 4, 0, 0, torus, (0, 0, 0), *[none] * 2, pivot, onto)
-            >>> join.place(np.array([[2.0, 0.0, 0.0]])).round(9).tolist()
-            [[5.0, 6.0, 1.570796327]]
+            >>> east = Correction(dx_m=0.1, heading_rad=0.0)
+            >>> [round(x, 9) for x in east.displacement(np.pi / 2)]  # its own frame is turned
+            [0.0, 0.1]
         """
-        turned = wrap_angles(poses[:, 2] - self.pivot.theta_rad + self.onto.theta_rad)
-        return np.column_stack([_moved(poses[:, :2], self.pivot, self.onto), turned])
+        return rotate(self.dx_m, self.dy_m, heading_rad - self.heading_rad)
 
     @property
-    def cells_turn_rad(self) -> float:
-        """By how much positions turn that partial cells keep."""
-        pivot, onto = self.cells or (self.pivot, self.onto)
-        return wrap_angle(onto.theta_rad - pivot.theta_rad)
+    def moves(self) -> bool:
+        """Whether it displaces or turns at all."""
+        return bool(self.dx_m or self.dy_m or self.turn_rad)
 
-    def place_cells(self, points_m: np.ndarray) -> np.ndarray:
-        """Move positions that partial cells keep, ``(n, 2)``, into the loaded cells' frame."""
-        return _moved(points_m, *(self.cells or (self.pivot, self.onto)))
-
-
-def _moved(points_m: np.ndarray, pivot: Pose, onto: Pose) -> np.ndarray:
-    """Turn points about a pose and move them, so that it comes to lie onto another."""
-    turn = onto.theta_rad - pivot.theta_rad
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = points_m[:, 0] - pivot.x_m, points_m[:, 1] - pivot.y_m
-    return np.column_stack([c * dx - s * dy + onto.x_m, s * dx + c * dy + onto.y_m])
+    @property
+    def is_nothing(self) -> bool:
+        """Whether no one has to follow."""
+        return not self.moves and self.position_m is None and not self.relocalises
 
 
-class Population(nn.Module, ABC):
-    """A part of the brain that says how it merges.
+def total(corrections: Sequence[Correction]) -> Correction:
+    """Add corrections of one instant, at least one.
 
-    A brain is made of these alone, so that no state can be forgotten when two brains merge.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_load_state_dict_pre_hook(_make_writable)
-
-    @staticmethod
-    @abstractmethod
-    def merged(loaded: State, partial: State, join: Join) -> State:
-        """Merge two states of this population into one; neither is altered.
-
-        Args:
-            loaded: State of the map that is merged into.
-            partial: State of the session that goes on.
-            join: How the partial one's ids and coordinates change.
-
-        Returns:
-            A state with the same names.
-        """
-
-    def __setattr__(self, name: str, value: object) -> None:
-        """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
-
-        Anything else is left to torch.
-        """
-        buffers = self.__dict__.get("_buffers")
-        if buffers is not None and type(value) is Tensor and name in buffers:
-            buffers[name] = value
-        else:
-            super().__setattr__(name, value)
-
-
-def without_gradients(step: Callable[P, T]) -> Callable[P, T]:
-    """Let a step run in inference mode; one that does so already loses no time by it."""
-
-    @wraps(step)
-    def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.is_inference_mode_enabled():
-            return step(*args, **kwargs)
-        with torch.inference_mode():
-            return step(*args, **kwargs)
-
-    return run
-
-
-def _make_writable(module: nn.Module, *_unused: object) -> None:
-    """Replace what was made in inference mode, which torch would not let a state be copied into."""
-    for name, buffer in module._buffers.items():
-        if buffer is not None and buffer.is_inference():
-            module._buffers[name] = buffer.clone()
-    for name, parameter in module._parameters.items():
-        if parameter is not None and parameter.is_inference():
-            module._parameters[name] = nn.Parameter(parameter.clone())
-
-
-class Running(Population):
-    """A population whose state is only about now: the session that goes on keeps its own."""
-
-    @staticmethod
-    def merged(_loaded: State, partial: State, _join: Join) -> State:
-        """Return the partial one's state."""
-        return dict(partial)
-
-
-def renamed(number: Tensor, ids: np.ndarray) -> Tensor:
-    """Look a number up in a table of ids; negative ones mean none, and stay.
+    Turns add; displacements do in the frame of the first that moves; the first absolute position
+    counts.
 
     Example:
-        >>> renamed(torch.tensor(1), np.array([5, 7])).item()
-        7
+        >>> total([Correction(turn_rad=0.1), Correction(0.2, 0.0, 0.1, heading_rad=1.0)])[:4]
+        (0.2, 0.0, 0.2, 1.0)
     """
-    old = int(number)
-    return number if old < 0 else number.new_tensor(int(ids[old]))
+    if len(corrections) == 1:
+        return corrections[0]
+    moving = [c for c in corrections if c.dx_m or c.dy_m] or corrections[:1]
+    heading, dx, dy, turn = moving[0].heading_rad, moving[0].dx_m, moving[0].dy_m, 0.0
+    for more in moving[1:]:
+        x, y = more.displacement(heading)
+        dx, dy = dx + x, dy + y
+    for correction in corrections:
+        turn += correction.turn_rad
+    absolute = next((c for c in corrections if c.position_m is not None), moving[0])
+    relocalises = any(c.relocalises for c in corrections)
+    return absolute._replace(
+        dx_m=dx, dy_m=dy, turn_rad=turn, heading_rad=heading, relocalises=relocalises
+    )
+
+
+class Belief(NamedTuple):
+    """Where the leading population believes the robot to be.
+
+    Attributes:
+        pose: Of the robot.
+        variance_m2: Mean variance of x and y.
+        experience: That the robot is at, on a map that relaxes; -1: there is none.
+        poses: Of all experiences of such a map, ``(n, 3)``.
+    """
+
+    pose: Pose
+    variance_m2: float = 0.0
+    experience: int = -1
+    poses: np.ndarray = np.empty((0, 3))
+
+    @property
+    def at(self) -> np.ndarray:
+        """Pose of the experience that the robot is at, ``(3,)``."""
+        return self.poses[self.experience]
+
+
+class Decision(NamedTuple):
+    """What the leader does on the map in a frame.
+
+    Attributes:
+        action: ``none``, ``create``, ``link`` or ``set``.
+        experience: That the robot is at then, -1 before the first.
+    """
+
+    action: Action
+    experience: int
+
+
+class Population(Mergeable):
+    """A population of cells that takes part in a brain; a subclass overrides what it needs.
+
+    Class attributes say what a brain has to know without knowing the population by name.
+
+    Attributes:
+        kind: Name in ``cells`` of the config; :func:`~neuroslam.state.registry.register` sets it.
+        name: Attribute of the brain, and prefix of the population's part of the state; the kind, if
+            not given.
+        config_section: Its parameters: table ``[kind]`` of the config.
+        merge_sections: Sections that must be equal in two brains that merge.
+        merge_rules: What becomes of a tensor of the state in a merge, by name or by the first part
+            of it; see :mod:`~neuroslam.state.mergeable`.
+        rank: Of the populations in a brain, the one of highest rank leads; 0: it cannot.
+        relaxes_map: As leader it decides by views before corrections, on a map that integrates
+            odometry and relaxes; else by position after them, on a map that shows its own cells.
+        needs_views: The brain makes views of its pictures.
+        compass: ``uses`` the compass; ``corrects``: tells the others what it says, too.
+    """
+
+    kind: ClassVar[str] = ""
+    name: ClassVar[str] = ""
+    config_section: ClassVar[type[Section] | None] = None
+    merge_sections: ClassVar[tuple[str, ...]] = ()
+    merge_rules: ClassVar[Mapping[str, Rule]] = {}
+    rank: ClassVar[int] = 0
+    relaxes_map: ClassVar[bool] = False
+    needs_views: ClassVar[bool] = False
+    compass: ClassVar[Literal["ignores", "uses", "corrects"]] = "ignores"
+
+    @classmethod
+    def build(cls, config: BrainConfig, leader: "type[Population]") -> Self:
+        """Make the population of a brain.
+
+        Args:
+            config: Of the brain.
+            leader: Class of the population that leads it.
+        """
+        return cls(config.section(cls.kind)) if cls.config_section else cls()
+
+    # --- a frame -------------------------------------------------------------------------------
+
+    def observe(self, frame: Frame) -> Observation | None:
+        """Find in a frame what the population senses; a pure function.
+
+        Raises:
+            BadFrame: If the frame holds what cannot be.
+        """
+
+    def check(self, now: StepInput, observation: Observation, belief: Belief | None) -> None:
+        """Refuse a frame that the population cannot take; nothing has changed yet.
+
+        Raises:
+            BadFrame, MapError: If so.
+        """
+
+    def step(self, now: StepInput, observation: Observation) -> Correction | None:
+        """Advance by self-motion and the population's own senses; return what those corrected."""
+
+    def vetoes(self, view: ViewMatch) -> bool:
+        """Tell whether the robot cannot be where a view was learnt."""
+        return False
+
+    def follow(self, correction: Correction) -> None:
+        """Follow what another population has corrected."""
+
+    def learn(self, now: StepInput, observation: Observation) -> None:
+        """Bind what is seen to the population's own position."""
+
+    def recall(
+        self, now: StepInput, observation: Observation, belief: Belief | None
+    ) -> Correction | None:
+        """Correct the robot's pose from memory.
+
+        Args:
+            now: The frame.
+            observation: What :meth:`observe` found in it.
+            belief: Of the leader; ``None`` for the leader itself.
+        """
+
+    # --- leading -------------------------------------------------------------------------------
+
+    def decide(self, map_: "LeadableMap", now: StepInput) -> Decision:
+        """Create, link or set an experience of the map; of a leader only."""
+        raise NotImplementedError(f"{type(self).__name__} cannot lead")
+
+    def belief(self, map_: "LeadableMap") -> Belief:
+        """Return where the population believes the robot to be; of a leader only."""
+        raise NotImplementedError(f"{type(self).__name__} cannot lead")
+
+    @property
+    def estimate(self) -> Any:  # noqa: ANN401 - of a batch it is a tensor
+        """Where the cells have the robot: columns ``pose_x``, ``pose_y``, ``pose_theta``."""
+        raise NotImplementedError(f"{type(self).__name__} cannot lead")
+
+    @property
+    def lost(self) -> bool:
+        """Whether its senses contradict what it knows of the place."""
+        return False
+
+    # --- what others ask -----------------------------------------------------------------------
+
+    @property
+    def rates(self) -> np.ndarray | None:
+        """Activity of the cells in a fixed order, ``(n_cells,)``; ``None``: nothing to record."""
+        return None
+
+    def counts(self) -> dict[str, float]:
+        """Return what was learnt, in numbers: ``metrics.json``, ``inspect``, reports of merges."""
+        return {}
+
+    def scalars(self) -> dict[str, float]:
+        """Return curves of TensorBoard: a value now for each tag."""
+        return {}
+
+    def images(self) -> dict[str, np.ndarray]:
+        """Return pictures for TensorBoard, plots and the report.
+
+        Each is activity, ``(h, w)`` of any scale, which is coloured, or ``uint8``, ``(h, w, 3)``.
+        """
+        return {}
+
+    def tables(self) -> dict[str, str]:
+        """Return CSV files of a run's folder by name; the first line has the columns."""
+        return {}
+
+    def points_m(self) -> np.ndarray | None:
+        """Return points to draw on the map, ``(n, 2)``."""
+        return None
+
+    @classmethod
+    def faults(
+        cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
+    ) -> Iterator[str]:
+        """Say what makes no sense in a state of the population, whose shapes fit the config."""
+        return iter(())
+
+    # --- merging -------------------------------------------------------------------------------
+
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Merge two states by :attr:`merge_rules`; a population with other needs overrides this."""
+        return merge_by_rules(self.merge_rules, loaded, partial, join)
+
+    def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
+        """Say how the frames lie in which two sessions keep positions, where it is not the map's.
+
+        Returns:
+            A pose in the partial session's frame, and the same in the loaded one's.
+        """
+
+    def moved_cells(
+        self, loaded: State, partial: State, match: Match, config: BrainConfig
+    ) -> MovedCells | None:
+        """Move what experiences and views are bound to, given the states of two whole brains."""
+
+    def match(
+        self, loaded: "Population", maps: tuple[np.ndarray, np.ndarray], config: BrainConfig
+    ) -> tuple[Match | None, str]:
+        """Find where the maps of two sessions meet, where this population leads without views.
+
+        Args:
+            loaded: The population of the other brain.
+            maps: Poses of the experiences of the loaded map and of this one, ``(n, 3)``.
+            config: Of both.
+
+        Returns:
+            Where they meet, or ``None``; and how that was found, or why not, for a reader.
+        """
+        return None, f"{self.kind} has no way to find where two maps meet"
+
+
+class LeadableMap(Protocol):
+    """What a leader uses of the experience map."""
+
+    @property
+    def n(self) -> int: ...
+    @property
+    def current(self) -> int: ...
+    @property
+    def pose(self) -> Pose: ...
+    @property
+    def pose_table(self) -> np.ndarray: ...
+    def visit(
+        self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None
+    ) -> tuple[Action, int]: ...
+    def __call__(
+        self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int, *, carried: bool
+    ) -> tuple[Action, int]: ...

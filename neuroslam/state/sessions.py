@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.state.population import Join, Population, State
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import Mergeable, State
 
 _ID_BITS = 40
 
@@ -74,7 +75,7 @@ def session_id(*parts: object) -> int:
     return int.from_bytes(digest.digest()[:8], "big") >> (64 - _ID_BITS)
 
 
-class SessionLog(Population):
+class SessionLog(Mergeable):
     """The sessions of a brain, the last being the one that goes on, and its merges.
 
     State is text, JSON in bytes: names and reports are no numbers.

@@ -7,7 +7,8 @@ from torch import nn
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
-from neuroslam.state.population import Join, Population, State, renamed
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import Mergeable, State, renamed
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
@@ -29,7 +30,7 @@ _AT_ONCE = 1024
 """Comparisons in full precision that are made together: some megabytes."""
 
 
-class LocalViewCells(Population):
+class LocalViewCells(Mergeable):
     r"""Stores views as templates and recognises them.
 
     The distance of a view :math:`q` to a template :math:`t` is the smallest mean absolute
@@ -79,8 +80,12 @@ class LocalViewCells(Population):
 
     @property
     def network_digest(self) -> int:
-        """Tells the networks apart that made the templates; 0: they are of grey, or none yet."""
-        return self.network.digest if self.config.features != "grey" else 0
+        """Tells the networks apart that make the templates; 0: grey, or none was loaded yet."""
+        if self.config.features == "grey":
+            return 0
+        if self.n or not isinstance(self.encoder, FeatureEncoder):
+            return self.network.digest
+        return self.encoder.__dict__.get("digest", 0)  # a cached property: loads nothing
 
     def encode(self, image: np.ndarray) -> np.ndarray:
         """Make the template of a picture: in [0, 1], ``(template_height, template_width)``.
@@ -92,11 +97,6 @@ class LocalViewCells(Population):
         """
         return self._encode(image).template
 
-    def go_on_from(self, before: "LocalViewCells") -> None:
-        """Make templates by the network of other cells: a frame may have been looked at already."""
-        if self.config.features != "grey":
-            self.network.digest = before.network_digest
-
     def load_network(self) -> None:
         """Load the network that makes templates, where there is one; it must be the map's.
 
@@ -105,9 +105,8 @@ class LocalViewCells(Population):
         """
         if not isinstance(self.encoder, FeatureEncoder):
             return
-        if not self.n:
-            self.network.digest = self.encoder.digest
-        elif self.network.digest != self.encoder.digest:
+        digest = self.encoder.digest
+        if self.n and self.network.digest != digest:
             raise ConfigError(
                 f"view.features = {self.config.features!r}: the {self.n} views of the map were "
                 "made with other weights; give those, or begin a new map"
@@ -241,6 +240,8 @@ class LocalViewCells(Population):
             row["values"] = torch.from_numpy(columns.reshape(-1))
         if self.config.mean_gate:
             row["mean"] = view.mean() if self._exact else pixels.mean() / 255.0
+        if isinstance(self.encoder, FeatureEncoder):
+            self.network.digest = self.encoder.digest
         return self.templates.append(**row)
 
     @staticmethod

@@ -1,0 +1,76 @@
+"""What matching and merging use of a brain, and whether two brains may be merged at all."""
+
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from neuroslam.config import BrainConfig
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.state.mergeable import Mergeable
+from neuroslam.state.population import Population
+from neuroslam.state.registry import population_classes
+from neuroslam.state.sessions import SessionLog
+from neuroslam.view.templates import LocalViewCells
+
+
+class Mapped(Protocol):
+    """A brain, as far as its map is concerned."""
+
+    config: BrainConfig
+    map: ExperienceMap
+    view: LocalViewCells
+    sessions: SessionLog
+
+    @property
+    def leader(self) -> Population: ...
+    @property
+    def populations(self) -> dict[str, Population]: ...
+    def parts(self) -> dict[str, Mergeable]: ...
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+
+def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
+    """Name the parameters of views and populations that differ: such brains cannot merge.
+
+    Where the file of a network's weights lies does not matter, see :func:`differing`.
+
+    Example:
+        >>> differing_keys(BrainConfig(), BrainConfig(view={"threshold": 0.04}))
+        ['view.threshold is 0.05 and 0.04']
+    """
+    if one.cells != other.cells:
+        return [f"cells is {'+'.join(one.cells)} and {'+'.join(other.cells)}"]
+    sections = ["view", "pose_cells"]
+    for population in population_classes(one):
+        own = (population.kind,) if population.config_section else ()
+        sections += [s for s in (*population.merge_sections, *own) if s not in sections]
+    differing = []
+    for section in sections:
+        first, second = (getattr(config, section).model_dump() for config in (one, other))
+        differing += [
+            f"{section}.{key} is {first[key]} and {second[key]}"
+            for key in first
+            if first[key] != second[key] and (section, key) != ("view", "weights")
+        ]
+    return differing
+
+
+def differing(one: Mapped, other: Mapped) -> list[str]:
+    """Name what keeps two brains from being merged: parameters, or the network of their views."""
+    keys = differing_keys(one.config, other.config)
+    networks = {brain.view.network_digest for brain in (one, other)} - {0}
+    if not keys and len(networks) > 1:
+        keys = [f"the weights of {one.config.view.features!r}, by which views were made"]
+    return keys
+
+
+def counts_of(brain: Mapped) -> dict[str, float]:
+    """Count what a brain has learnt: views, experiences, links, and what its populations count."""
+    counts: dict[str, Any] = {
+        "views": brain.view.n,
+        "experiences": brain.map.n,
+        "links": brain.map.n_links,
+    }
+    for population in brain.populations.values():
+        counts |= population.counts()
+    return counts

@@ -1,0 +1,193 @@
+"""Modules whose state is saved and merged, and rules by which two states become one."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuroslam.errors import MapError
+from neuroslam.state.join import Join
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+State = dict[str, Tensor]
+"""A ``state_dict``, or the part of one that belongs to a module, without its prefix."""
+
+Rule = Callable[[Tensor, Tensor, Join], Tensor]
+"""Merge of a loaded and a partial tensor of one name."""
+
+
+class BufferModule(nn.Module):
+    """A module whose state is in buffers that are replaced in every step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_load_state_dict_pre_hook(_make_writable)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
+
+        Anything else is left to torch.
+        """
+        buffers = self.__dict__.get("_buffers")
+        if buffers is not None and type(value) is Tensor and name in buffers:
+            buffers[name] = value
+        else:
+            super().__setattr__(name, value)
+
+
+class Mergeable(BufferModule, ABC):
+    """A part of the brain that says how two of its states become one.
+
+    A brain is made of these alone, so that no state can be forgotten when two brains merge.
+    """
+
+    @abstractmethod
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Merge two states into one; neither is altered.
+
+        Args:
+            loaded: State of the map that is merged into.
+            partial: State of the session that goes on.
+            join: How the partial one's ids and coordinates change.
+
+        Returns:
+            A state with the same names.
+        """
+
+
+class AboutNow(Mergeable):
+    """A part whose state is about the present alone: the session that goes on keeps its own."""
+
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Return the partial one's state."""
+        return dict(partial)
+
+
+def _make_writable(module: nn.Module, *_unused: object) -> None:
+    """Replace what was made in inference mode, which torch would not let a state be copied into."""
+    for name, buffer in module._buffers.items():
+        if buffer is not None and buffer.is_inference():
+            module._buffers[name] = buffer.clone()
+    for name, parameter in module._parameters.items():
+        if parameter is not None and parameter.is_inference():
+            module._parameters[name] = nn.Parameter(parameter.clone())
+
+
+def without_gradients(step: Callable[P, T]) -> Callable[P, T]:
+    """Let a step run in inference mode; one that does so already loses no time by it."""
+
+    @wraps(step)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        if torch.is_inference_mode_enabled():
+            return step(*args, **kwargs)
+        with torch.inference_mode():
+            return step(*args, **kwargs)
+
+    return run
+
+
+# --- rules ---------------------------------------------------------------------------------------
+
+
+def about_now(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Keep the value of the session that goes on: it is about the present, and nothing is learnt."""
+    return partial
+
+
+def summed(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Add sums and counts of one shape.
+
+    Example:
+        >>> summed(torch.tensor([1, 2]), torch.tensor([3, 4]), Join.nothing()).tolist()
+        [4, 6]
+    """
+    return loaded + partial
+
+
+def summed_by_view(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Add sums and counts that have a row for each view; rows of equal views become one.
+
+    Example:
+        >>> join = Join.nothing()._replace(views=np.array([1, 2]), n_views=2)
+        >>> summed_by_view(torch.tensor([5, 5]), torch.tensor([1, 3]), join).tolist()
+        [5, 6, 3]
+    """
+    return _summed_rows(loaded, partial, join.views)
+
+
+def summed_by_experience(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Add sums and counts that have a row for each experience; rows of equal ones become one."""
+    return _summed_rows(loaded, partial, join.experiences)
+
+
+def _summed_rows(loaded: Tensor, partial: Tensor, ids: np.ndarray) -> Tensor:
+    to = torch.from_numpy(ids[: len(partial)])
+    n = max(len(loaded), int(to.max()) + 1 if len(to) else 0)
+    grown = loaded.new_zeros((n, *loaded.shape[1:]))
+    grown[: len(loaded)] = loaded
+    return grown.index_add(0, to, partial.to(grown)[: len(to)])
+
+
+def rows_of_views(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Keep the loaded rows, then those of partial views that are new; a row for each view.
+
+    Example:
+        >>> join = Join.nothing()._replace(views=np.array([0, 2]), n_views=2)
+        >>> rows_of_views(torch.tensor([5, 6]), torch.tensor([1, 3]), join).tolist()
+        [5, 6, 3]
+    """
+    return torch.cat([loaded, partial[torch.from_numpy(join.kept_views)].to(loaded)])
+
+
+def renamed(number: Tensor, ids: np.ndarray) -> Tensor:
+    """Look a number up in a table of ids; negative ones mean none, and stay.
+
+    Example:
+        >>> renamed(torch.tensor(1), np.array([5, 7])).item()
+        7
+    """
+    old = int(number)
+    return number if old < 0 else number.new_tensor(int(ids[old]))
+
+
+def view_id(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Rename the id of a view; -1 stays."""
+    return renamed(partial, join.views)
+
+
+def experience_id(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Rename the id of an experience; -1 stays."""
+    return renamed(partial, join.experiences)
+
+
+def rule_of(name: str, rules: Mapping[str, Rule]) -> Rule | None:
+    """Return the rule of a tensor: of its own name, or of the first part of it.
+
+    Example:
+        >>> rule_of("counts.sum", {"counts": summed}) is summed, rule_of("rates", {})
+        (True, None)
+    """
+    return rules.get(name) or rules.get(name.partition(".")[0])
+
+
+def merge_by_rules(
+    rules: Mapping[str, Rule], loaded: State, partial: State, join: Join
+) -> State:
+    """Merge every tensor by its rule.
+
+    Raises:
+        MapError: If one has none: what is learnt is not lost in silence.
+    """
+    merged: State = {}
+    for name, value in partial.items():
+        rule = rule_of(name, rules)
+        if rule is None:
+            raise MapError(f"merge: {name} has no rule; add it to merge_rules")
+        merged[name] = rule(loaded[name], value, join)
+    return merged
