@@ -5,8 +5,7 @@ import pytest
 
 from neuroslam.evaluation.ratemap import Bins
 from neuroslam.figures import cells as cd
-from neuroslam.figures.maps import render
-from neuroslam.figures.style import new_figure
+from neuroslam.figures.style import new_figure, render
 from neuroslam.worlds.arena import Arena, named_arena
 
 ARENA = named_arena("square")

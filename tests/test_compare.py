@@ -15,7 +15,7 @@ from neuroslam.experiments.compare import (
     pixel_landmarks,
 )
 from neuroslam.figures.comparison import plot_losses
-from neuroslam.figures.maps import render
+from neuroslam.figures.style import render
 from neuroslam.sensors import open_source
 
 

@@ -15,8 +15,10 @@ from neuroslam.brain.checkpoint import FORMAT_VERSION
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, experiences_csv, links_csv
-from neuroslam.runs.inspect import inspect, verify
-from neuroslam.runs.run import RunSummary, run
+from neuroslam.runs.inspect import inspect
+from neuroslam.runs.results import RunSummary
+from neuroslam.runs.run import run
+from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
 from neuroslam.state.files import tensors_digest
 

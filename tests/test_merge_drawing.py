@@ -7,9 +7,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from mpl_toolkits.mplot3d.art3d import Line3D, Line3DCollection
 
-from neuroslam.figures import maps as plotting
 from neuroslam.figures import sessions as md
-from neuroslam.figures import style as drawing
+from neuroslam.figures import style
 
 TORUS = (21, 21, 36)
 
@@ -128,15 +127,15 @@ def as_rows(points):
 
 @ALL
 def test_equal_figures_give_equal_bytes(draw, tmp_path):
-    plotting.save(draw.__wrapped__(), tmp_path / "one.png", dpi=60)
-    plotting.save(draw.__wrapped__(), tmp_path / "two.png", dpi=60)
+    style.save(draw.__wrapped__(), tmp_path / "one.png", dpi=60)
+    style.save(draw.__wrapped__(), tmp_path / "two.png", dpi=60)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
 @ALL
 def test_no_text_is_clipped_or_lies_on_another(draw):
     figure = draw()
-    with mpl.rc_context(plotting.STYLE):
+    with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
     boxes = [figure.legends[0].get_window_extent()]
     boxes += [figure._suptitle.get_window_extent()] if figure._suptitle else []
@@ -157,7 +156,7 @@ def test_no_text_is_clipped_or_lies_on_another(draw):
 @FLAT
 def test_a_metre_is_a_metre_and_everything_is_in_sight(draw):
     figure = draw()
-    with mpl.rc_context(plotting.STYLE):
+    with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -174,7 +173,7 @@ def test_a_metre_is_a_metre_and_everything_is_in_sight(draw):
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_the_axes_of_bindings_keep_their_names(n):
     figure = md.plot_bindings((groups() * 2)[:n], TORUS, "Bindings")
-    with mpl.rc_context(plotting.STYLE):
+    with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
     boxes = [axes.zaxis.label.get_window_extent() for axes in figure.axes]
     assert all(box.x1 < figure.bbox.x1 for box in boxes)
@@ -188,7 +187,7 @@ def test_the_axes_of_bindings_keep_their_names(n):
 @FLAT
 def test_panels_fill_the_width_they_have(draw):
     figure = draw()
-    with mpl.rc_context(plotting.STYLE):
+    with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
     columns = figure.axes[0].get_gridspec().ncols
     for axes in figure.axes:
@@ -218,8 +217,8 @@ def test_every_experience_and_link_is_drawn_in_the_colour_of_its_session():
     lines = [c for c in axes.collections if isinstance(c, LineCollection)]
     by_colour = {to_hex(c.get_color()[0]): len(c.get_segments()) for c in lines}
     assert by_colour == {
-        drawing.MAP.lower(): 39,
-        drawing.ROBOT.lower(): 31,
+        style.MAP.lower(): 39,
+        style.ROBOT.lower(): 31,
     }  # a bridge is of the later one
     assert [len(markers(axes, kind)) for kind in "XD"] == [2, 2]
     assert np.array_equal(rings(axes)[0].get_xydata(), FINAL.merge_points)
@@ -274,7 +273,7 @@ def test_sessions_with_names_are_all_in_the_legend_whether_or_not_they_made_a_pl
     assert legend_of(figure) == names
     colours = [to_hex(line.get_color()) for line in figure.legends[0].get_lines()]
     assert colours == [colour.lower() for colour in md.SESSIONS[:3]]
-    plotting.render(figure)
+    style.render(figure)
     assert figure.legends[0].get_window_extent().x1 < figure.bbox.x1
 
 
@@ -290,7 +289,7 @@ def test_a_map_of_one_experience_or_none_can_be_drawn():
     first, second = md.plot_stages([one, none]).axes
     assert said(first) == "1 experience · 0 links"
     assert said(second) == "0 experiences · 0 links"
-    plotting.render(md.plot_stages([none]))
+    style.render(md.plot_stages([none]))
 
 
 def test_bindings_show_every_cell_on_the_whole_torus():

@@ -18,8 +18,9 @@ import torch
 from neuroslam import load_brain, run
 from neuroslam.brain.merge import MergeReport
 from neuroslam.cli import main
-from neuroslam.runs import review
-from neuroslam.runs.files import RUN_FILES, RunPlan, read_frames
+from neuroslam.runs import plot
+from neuroslam.runs.files import RUN_FILES, RunPlan
+from neuroslam.runs.reading import read_frames
 
 WORLD = "world:ellipse?laps=2&width=128&height=32"
 OTHER = "world:corridor?laps=1&width=128&height=32"
@@ -70,8 +71,8 @@ def drawn(monkeypatch):
 
     def draw(out):
         figures = []
-        monkeypatch.setattr(review, "save", lambda figure, _path: figures.append(figure))
-        review.plot(out, out)
+        monkeypatch.setattr(plot, "save", lambda figure, _path: figures.append(figure))
+        plot.plot(out, out)
         legends = [axes.get_legend() for axes in figures[0].get_axes()]
         names = [[text.get_text() for text in legend.get_texts()] for legend in legends]
         return figures[0].get_suptitle(), *names
@@ -112,11 +113,11 @@ def test_the_map_says_how_many_frames_are_on_maps_that_were_not_joined(runs):
     brain, plan = load_brain(runs / "a" / "brain.safetensors"), RunPlan("long/way/drive.mp4")
     on_map = np.arange(1000) < 28
     brain.store(load_brain(runs / "elsewhere" / "brain.safetensors"))
-    assert review._title(brain, plan, on_map).splitlines() == [
+    assert plot._title(brain, plan, on_map).splitlines() == [
         "way/drive.mp4: 1,000 frames",
         "972 of 1,000 frames are on maps that were not joined",
     ]
-    all_here = review._title(brain, plan, on_map[:28])
+    all_here = plot._title(brain, plan, on_map[:28])
     assert all_here == "way/drive.mp4: 28 frames\n1 stored map was not joined"
 
 

@@ -12,9 +12,10 @@ from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.errors import BadFrame
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
 from neuroslam.geometry import wrap_angles
-from neuroslam.runs.inspect import inspect, verify
+from neuroslam.runs.inspect import inspect
 from neuroslam.runs.merge import join_brains, merge_runs
 from neuroslam.runs.run import resume, run
+from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
 

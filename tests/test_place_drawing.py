@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuroslam.figures import places as pd
-from neuroslam.figures.maps import render, save
+from neuroslam.figures.style import render, save
 from neuroslam.types import Pose
 from neuroslam.worlds.arena import named_arena
 

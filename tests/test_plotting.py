@@ -8,8 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.font_manager import fontManager
 
-from neuroslam.figures import maps as plotting
-from neuroslam.figures import style as drawing
+from neuroslam.figures import maps, style
 from neuroslam.geometry import integrate_velocities
 from neuroslam.types import Pose, PoseEstimate
 
@@ -50,7 +49,7 @@ def full_map():
     odometry, poses = maze_run()
     links = np.column_stack([np.arange(19), np.arange(1, 20)])
     walls = [[[-1.0, -1.0], [3.0, -1.0]], [[3.0, -1.0], [3.0, 4.0]]]
-    return plotting.plot_map(
+    return maps.plot_map(
         poses,
         np.vstack([links, [[0, 12], [3, 17]]]),
         odometry_xy=odometry,
@@ -65,7 +64,7 @@ def full_map():
 def full_summary():
     odometry, poses = maze_run()
     image = pictures(1, (120, 160, 3))[0]
-    return plotting.plot_summary(
+    return maps.plot_summary(
         poses,
         np.column_stack([np.arange(19), np.arange(1, 20)]),
         frames(),
@@ -83,16 +82,16 @@ def full_summary():
 
 FIGURES = {
     "map": full_map,
-    "map alone": lambda: plotting.plot_map(SQUARE, RING),
-    "pose cells": lambda: plotting.plot_pose_cells(
+    "map alone": lambda: maps.plot_map(SQUARE, RING),
+    "pose cells": lambda: maps.plot_pose_cells(
         packet(), PoseEstimate(11.0, 5.0, 9.0), PoseEstimate(12.0, 5.0, 8.0)
     ),
-    "view": lambda: plotting.plot_frame_and_template(*pictures(2, (12, 60)), 0.031, 12),
-    "signals": lambda: plotting.plot_signals(frames(), threshold=0.05),
-    "precision": lambda: plotting.plot_precision_recall(
+    "view": lambda: maps.plot_frame_and_template(*pictures(2, (12, 60)), 0.031, 12),
+    "signals": lambda: maps.plot_signals(frames(), threshold=0.05),
+    "precision": lambda: maps.plot_precision_recall(
         {name: (np.linspace(1, 0.3, 9), np.linspace(0, 1, 9)) for name in ("ours", "theirs")}
     ),
-    "sheet": lambda: plotting.contact_sheet(pictures(7), [f"template {i}" for i in range(7)]),
+    "sheet": lambda: maps.contact_sheet(pictures(7), [f"template {i}" for i in range(7)]),
     "summary": full_summary,
 }
 
@@ -104,7 +103,7 @@ def all_axes(figure):
 @pytest.mark.parametrize("name", FIGURES)
 def test_nothing_is_cut_off_and_titles_do_not_run_into_each_other(name):
     figure = FIGURES[name]()
-    plotting.render(figure)
+    style.render(figure)
     page = figure.bbox
     for axes in all_axes(figure):
         words = [
@@ -128,9 +127,9 @@ def test_nothing_is_cut_off_and_titles_do_not_run_into_each_other(name):
 
 @pytest.mark.parametrize("name", ["map", "pose cells", "summary"])
 def test_the_same_figure_gives_the_same_bytes_whatever_the_users_style(name, tmp_path):
-    plotting.save(FIGURES[name](), tmp_path / "a.png")
+    style.save(FIGURES[name](), tmp_path / "a.png")
     with mpl.rc_context({"font.size": 20, "axes.grid": False, "axes.facecolor": "white"}):
-        plotting.save(FIGURES[name](), tmp_path / "b.png")
+        style.save(FIGURES[name](), tmp_path / "b.png")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
 
@@ -140,8 +139,8 @@ def test_drawing_leaves_pyplot_and_the_users_settings_alone():
 import sys, numpy as np, matplotlib
 names = ("font.size", "axes.grid", "font.family", "image.interpolation")
 before = [matplotlib.rcParams[name] for name in names]
-from neuroslam.figures import style as drawing, maps as plotting
-plotting.render(plotting.plot_map(np.zeros((2, 3)), np.array([[0, 1]])))
+from neuroslam.figures import maps, style
+style.render(maps.plot_map(np.zeros((2, 3)), np.array([[0, 1]])))
 print("matplotlib.pyplot" in sys.modules, before == [matplotlib.rcParams[name] for name in names])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -156,9 +155,9 @@ def segments(axes, colour):
 
 
 def test_a_link_between_neighbours_in_time_is_blue_and_any_other_is_a_loop_closure():
-    axes = plotting.plot_map(SQUARE, RING).get_axes()[0]
-    assert len(segments(axes, drawing.MAP)) == 3
-    (loop,) = segments(axes, drawing.LOOP)
+    axes = maps.plot_map(SQUARE, RING).get_axes()[0]
+    assert len(segments(axes, style.MAP)) == 3
+    (loop,) = segments(axes, style.LOOP)
     np.testing.assert_array_equal(loop, SQUARE[[3, 0], :2])
     assert axes.get_title("right") == "4 experiences · 4 links · 1 loop closure"
 
@@ -170,16 +169,16 @@ def test_the_counts_of_a_real_map_are_in_its_title(shared):
     links = np.loadtxt(folder / "usi_track1_sync_links.csv", **read)[:, :2]
     v, w = np.loadtxt(shared / "data/usi_track1/odometry_vo.csv", **read).T
     track = integrate_velocities(v, w, np.full(len(v), 0.05))
-    left, right = plotting.plot_map(poses, links, odometry_xy=track[:, :2]).get_axes()
+    left, right = maps.plot_map(poses, links, odometry_xy=track[:, :2]).get_axes()
     assert left.get_title("right").startswith("2,873 frames · ")
     assert right.get_title("right") == "1,140 experiences · 1,418 links · 279 loop closures"
-    assert len(segments(right, drawing.LOOP)) == 279
-    assert len(segments(right, drawing.MAP)) == 1139
+    assert len(segments(right, style.LOOP)) == 279
+    assert len(segments(right, style.MAP)) == 1139
 
 
 def test_a_metre_is_as_long_upward_as_sideways():
     figure = full_map()
-    plotting.render(figure)
+    style.render(figure)
     for axes in figure.get_axes():
         (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
         assert x1 - x0 == pytest.approx(y1 - y0)
@@ -187,7 +186,7 @@ def test_a_metre_is_as_long_upward_as_sideways():
 
 def test_the_legend_lies_below_the_data():
     figure = full_map()
-    plotting.render(figure)
+    style.render(figure)
     for axes in figure.get_axes():
         assert axes.get_legend().get_window_extent().y1 < axes.bbox.y0
 
@@ -196,10 +195,10 @@ def test_the_map_stays_where_it_is_and_the_truth_is_laid_over_it_with_its_walls_
     c, s = np.cos(0.5), np.sin(0.5)
     truth = 2.0 * SQUARE[:, :2] @ np.array([[c, -s], [s, c]]).T + [10.0, -5.0]
     here = Pose(0.0, 1.0, 0.25)
-    figure = plotting.plot_map(SQUARE, RING, truth_xy=truth, walls=[truth[:2]], current=here)
+    figure = maps.plot_map(SQUARE, RING, truth_xy=truth, walls=[truth[:2]], current=here)
     axes = figure.get_axes()[0]
-    np.testing.assert_array_equal(segments(axes, drawing.LOOP)[0], SQUARE[[3, 0], :2])
-    np.testing.assert_allclose(segments(axes, drawing.WALL)[0], SQUARE[:2, :2], atol=1e-9)
+    np.testing.assert_array_equal(segments(axes, style.LOOP)[0], SQUARE[[3, 0], :2])
+    np.testing.assert_allclose(segments(axes, style.WALL)[0], SQUARE[:2, :2], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
     laid = labels["truth: ATE 0.0 cm, scaled by 0.5"]
     np.testing.assert_allclose(laid.get_xydata(), SQUARE[:, :2], atol=1e-9)
@@ -212,7 +211,7 @@ def test_the_map_stays_where_it_is_and_the_truth_is_laid_over_it_with_its_walls_
 def test_places_and_links_have_the_colour_of_their_session_which_the_legend_names():
     names = ["monday.mp4", "tuesday.mp4", "wednesday.mp4"]
     session = np.array([0, 0, 1, 1])
-    figure = plotting.plot_map(
+    figure = maps.plot_map(
         SQUARE, RING, odometry_xy=SQUARE[2:, :2], session=session, session_names=names,
         odometry_of="tuesday.mp4",
     )  # fmt: skip
@@ -222,9 +221,9 @@ def test_places_and_links_have_the_colour_of_their_session_which_the_legend_name
         for line in right.get_lines()
         if line.get_ls() == "None" and line.get_label().startswith("_") and len(line.get_xydata())
     }
-    assert list(dots) == [colour.lower() for colour in drawing.SESSIONS[:2]]
-    np.testing.assert_array_equal(dots[drawing.MAP.lower()], SQUARE[:2, :2])
-    assert [len(segments(right, colour)) for colour in drawing.SESSIONS[:2]] == [1, 2]
+    assert list(dots) == [colour.lower() for colour in style.SESSIONS[:2]]
+    np.testing.assert_array_equal(dots[style.MAP.lower()], SQUARE[:2, :2])
+    assert [len(segments(right, colour)) for colour in style.SESSIONS[:2]] == [1, 2]
     assert [text.get_text() for text in right.get_legend().get_texts()] == [
         "monday.mp4", "tuesday.mp4", "wednesday.mp4: no place of its own", "loop closure", "start",
         "end",
@@ -234,19 +233,19 @@ def test_places_and_links_have_the_colour_of_their_session_which_the_legend_name
 
 def test_a_truth_that_does_not_fit_the_track_is_refused():
     with pytest.raises(ValueError, match="truth_xy has 7 points and the track 4; give track_xy"):
-        plotting.plot_map(SQUARE, RING, truth_xy=np.zeros((7, 2)))
+        maps.plot_map(SQUARE, RING, truth_xy=np.zeros((7, 2)))
 
 
 def test_a_robot_that_stood_still_is_drawn_where_it_stood():
-    figure = plotting.plot_map(SQUARE[:1], np.empty((0, 2)), truth_xy=[[0.0, 3.0]])
+    figure = maps.plot_map(SQUARE[:1], np.empty((0, 2)), truth_xy=[[0.0, 3.0]])
     labels = [line.get_label() for line in figure.get_axes()[0].get_lines()]
     assert "truth: ATE 3.00 m, not aligned" in labels
 
 
 def test_a_map_without_a_single_experience_says_so_and_shows_no_robot():
     none, here = np.empty((0, 2)), Pose(0.0, 0.0, 0.0)
-    figure = plotting.plot_map(np.empty((0, 3)), none, odometry_xy=none, current=here)
-    assert plotting.render(figure).std() > 0
+    figure = maps.plot_map(np.empty((0, 3)), none, odometry_xy=none, current=here)
+    assert style.render(figure).std() > 0
     axes = figure.get_axes()[1]
     assert axes.get_title("right") == "0 experiences · 0 links · 0 loop closures"
     assert [text.get_text() for text in axes.texts] == ["no places"]
@@ -255,7 +254,7 @@ def test_a_map_without_a_single_experience_says_so_and_shows_no_robot():
 
 def test_pose_cells_are_shown_from_above_and_from_the_side_with_all_their_activity():
     activity = packet()
-    figure = plotting.plot_pose_cells(activity, PoseEstimate(11.0, 5.0, 9.0))
+    figure = maps.plot_pose_cells(activity, PoseEstimate(11.0, 5.0, 9.0))
     place, heading = figure.get_axes()[:2]
     np.testing.assert_array_equal(place.get_images()[0].get_array(), activity.sum(axis=0))
     np.testing.assert_array_equal(heading.get_images()[0].get_array(), activity.sum(axis=1))
@@ -266,7 +265,7 @@ def test_pose_cells_are_shown_from_above_and_from_the_side_with_all_their_activi
 
 
 def test_views_above_the_threshold_are_new_and_the_first_has_no_error():
-    figure = plotting.plot_signals(frames(), threshold=0.05)
+    figure = maps.plot_signals(frames(), threshold=0.05)
     known, new, _ = figure.get_axes()[0].get_lines()
     assert np.nanmax(known.get_ydata()) <= 0.05 < np.min(new.get_ydata())
     assert np.isfinite(known.get_ydata()).sum() + len(new.get_ydata()) == 39
@@ -276,23 +275,23 @@ def test_views_above_the_threshold_are_new_and_the_first_has_no_error():
 
 def test_without_views_there_is_no_recognition_and_no_count_of_templates():
     blind = frames() | {"match_error": np.full(40, -1.0), "n_templates": np.zeros(40)}
-    (memory,) = plotting.plot_signals(blind, threshold=0.05).get_axes()
+    (memory,) = maps.plot_signals(blind, threshold=0.05).get_axes()
     assert memory.get_title("left") == "Memory"
     labels = [text.get_text() for text in memory.get_legend().get_texts()]
     assert labels == ["22 links", "21 experiences"]
 
 
 def test_names_in_any_script_are_drawn_without_a_warning(tmp_path):
-    figure = plotting.plot_map(SQUARE, RING, title="東京 서울 🐀")
-    plotting.render(figure)
-    plotting.save(figure, tmp_path / "map.png")
+    figure = maps.plot_map(SQUARE, RING, title="東京 서울 🐀")
+    style.render(figure)
+    style.save(figure, tmp_path / "map.png")
     there = set(fontManager.get_font_names())
-    assert set(drawing.STYLE["font.family"]) <= there
+    assert set(style.STYLE["font.family"]) <= there
 
 
 def test_a_first_view_says_that_there_was_nothing_to_compare_with():
     image = pictures(1)[0]
-    axes = plotting.plot_frame_and_template(image, image / 255.0, -1.0, 0).get_axes()[1]
+    axes = maps.plot_frame_and_template(image, image / 255.0, -1.0, 0).get_axes()[1]
     assert axes.get_title("left") == "Template 0"
     assert axes.get_title("right") == "the first view"
     assert axes.get_images()[0].get_clim() == (0, 1)
@@ -300,7 +299,7 @@ def test_a_first_view_says_that_there_was_nothing_to_compare_with():
 
 def test_a_contact_sheet_holds_every_picture_unchanged():
     images = pictures(7, (12, 16, 3))
-    axes = plotting.contact_sheet(images, [f"frame {i}" for i in range(7)]).get_axes()[0]
+    axes = maps.contact_sheet(images, [f"frame {i}" for i in range(7)]).get_axes()[0]
     sheet = np.asarray(axes.get_images()[0].get_array())
     windows = np.lib.stride_tricks.sliding_window_view(sheet, (12, 16, 3))[:, :, 0]
     for image in images:
@@ -318,11 +317,11 @@ def test_a_contact_sheet_holds_every_picture_unchanged():
 )
 def test_a_sheet_of_unequal_pictures_is_refused(images, titles, said):
     with pytest.raises(ValueError, match=said):
-        plotting.contact_sheet(images, titles)
+        maps.contact_sheet(images, titles)
 
 
 def test_a_summary_leaves_out_what_the_brain_does_not_have():
-    figure = plotting.plot_summary(SQUARE, RING, frames())
+    figure = maps.plot_summary(SQUARE, RING, frames())
     names = [axes.get_title("left") for axes in figure.get_axes()]
     assert names == ["Experience map", "Recognition", "Memory"]
-    assert plotting.render(figure).shape == (1000, 1400, 3)
+    assert style.render(figure).shape == (1000, 1400, 3)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from neuroslam.cli import main
-from neuroslam.runs.files import RUN_FILES, read_frames, read_trace
+from neuroslam.runs.files import RUN_FILES
+from neuroslam.runs.reading import read_frames, read_trace
 from neuroslam.runs.recording import TensorBoardRecorder
 from neuroslam.runs.run import run
 
@@ -224,7 +225,7 @@ def test_a_kill_between_any_two_files_of_the_end_leaves_a_run_that_goes_on(
     """Every file of the end is written whole; here the process dies before one of them."""
     uncut = tmp_path / "uncut"
     run(WORLD, uncut, stop=40, tensorboard=False)
-    import neuroslam.runs.run as runs
+    from neuroslam.runs import results
 
     for name in ("save_brain", "experiences_csv", "write_tum", "draw_map"):
         out = shutil.copytree(copy, tmp_path / name)
@@ -233,7 +234,7 @@ def test_a_kill_between_any_two_files_of_the_end_leaves_a_run_that_goes_on(
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(runs, name, die)
+            patch.setattr(results, name, die)
             assert says("resume", out, "--stop", 40, QUICK)[0] == 130
         assert says("resume", out, "--stop", 40, QUICK)[0] == 0
         for file in set(RUN_FILES) - {"metrics.json", "config.toml"}:

@@ -7,7 +7,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from neuroslam.config.semantic import PathIntegratorConfig, SSPSLAMConfig
 from neuroslam.experiments.ssp_lives import slam_in, views
-from neuroslam.runs.semantic_panels import SemanticPanels
+from neuroslam.runs.panels import SemanticPanels
 from neuroslam.worlds.landmarks import make_world, point
 
 

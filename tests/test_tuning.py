@@ -16,7 +16,7 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, build_config, read_config_file, read_preset
 from neuroslam.errors import BadFrame, RunError, SourceError
-from neuroslam.figures.maps import render
+from neuroslam.figures.style import render
 from neuroslam.figures.tuning import plot_tuning
 from neuroslam.sensors import open_source
 from neuroslam.tuning import tune

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from neuroslam.errors import SourceError
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.types import Pose
-from neuroslam.worlds.catalogue import Sense, build_world, catalogue
+from neuroslam.worlds.catalogue import build_world, catalogue
 from neuroslam.worlds.render import Camera, cast, render
-from neuroslam.worlds.scene import Surface, World, rounded_route
+from neuroslam.worlds.scene import Sense, Surface, World, rounded_route
 from neuroslam.worlds.world import OdometryNoise, WorldOptions, WorldSource, open_world
 
 NAMES = list(catalogue())

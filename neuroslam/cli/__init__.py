@@ -24,7 +24,7 @@ from neuroslam.errors import ConfigError, NeuroslamError, counted
 from neuroslam.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
-    from neuroslam.runs.run import RunSummary
+    from neuroslam.runs.results import RunSummary
     from neuroslam.types import StepResult
 
 
@@ -412,7 +412,7 @@ def inspect_command(path: MapFile) -> int:
 @app.command("verify")
 def verify_command(path: MapFile) -> int:
     """Check a map: exit 0 if it is sound, 2 with its faults if not."""
-    from neuroslam.runs.inspect import verify
+    from neuroslam.runs.verify import verify
 
     faults = verify(path)
     for fault in faults:
@@ -466,7 +466,7 @@ def evaluate_command(
     align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
 ) -> int:
     """Compare a track with the truth."""
-    from neuroslam.runs.review import evaluate
+    from neuroslam.runs.evaluate import evaluate
 
     table = Table(title=f"{track} against the truth, {align} alignment")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
@@ -486,7 +486,7 @@ def plot_command(
     to: Annotated[Path | None, typer.Option(help="Folder for the figures; DIR itself.")] = None,
 ) -> int:
     """Draw the map, the cells that the brain has, and counts over time."""
-    from neuroslam.runs.review import plot
+    from neuroslam.runs.plot import plot
 
     for path in plot(out, to or out):
         console.print(str(path))

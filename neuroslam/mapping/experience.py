@@ -24,14 +24,7 @@ from neuroslam.mapping.tables import (
 )
 from neuroslam.state.population import Join, Population, State
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import (
-    NO_EXPERIENCE,
-    NO_TEMPLATE,
-    Motion,
-    Pose,
-    PoseEstimate,
-    ViewMatch,
-)
+from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Motion, Pose, PoseEstimate, ViewMatch
 
 Action = Literal["none", "create", "link", "set"]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
-from neuroslam.figures.maps import save
+from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
