@@ -16,8 +16,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 
-from neuroslam import cli
-from neuroslam.cli import main
+from neuroslam.cli import main, output
 from neuroslam.config import preset_names
 from neuroslam.runs.inspect import inspect
 from neuroslam.runs.reading import read_frames
@@ -530,8 +529,8 @@ def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):
 
 def test_words_of_a_table_are_never_cut(monkeypatch, capsys):
     told = "".join(sorted(preset_names()))
-    monkeypatch.setattr(cli, "console", Console(width=30))
-    assert cli.main(["presets"]) == 0
+    monkeypatch.setattr(output, "console", Console(width=30))
+    assert main(["presets"]) == 0
     shown = capsys.readouterr().out
     assert "…" not in shown
     names = "".join(line.split("│")[1].strip() for line in shown.splitlines() if "│" in line)

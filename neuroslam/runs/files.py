@@ -39,6 +39,7 @@ LANDMARKS_FILE = "landmarks.csv"
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
 """Figures of a run that differ from one time to the next; all others do not."""
 
+
 OnBadFrame = Literal["skip", "stop"]
 
 
