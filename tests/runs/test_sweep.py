@@ -183,7 +183,7 @@ def test_two_at_once_give_the_files_of_one_after_the_other(serial, tmp_path, cal
 def test_a_local_ray_of_two_workers_gives_the_files_of_one_after_the_other(serial, tmp_path):
     out = tmp_path / "ray"
     command = [sys.executable, "-m", "neuroslam.cli", *ARGUMENTS, "-o", str(out)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     done = subprocess.run(
         [*command, "--ray", "local", "--jobs", "2"],
         capture_output=True, text=True, check=False, env=environment,
@@ -227,7 +227,7 @@ def test_ctrl_c_ends_all_runs_and_tells_what_was_done(tmp_path):
         [sys.executable, "-m", "neuroslam.cli", "sweep", str(tmp_path / "nowhere.avi"), long,
          f"{long}&noise=0.1", "-o", str(out), "--jobs", "2"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
     )  # fmt: skip
     with process:
         end = time.monotonic() + 120

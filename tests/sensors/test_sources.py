@@ -315,7 +315,7 @@ for path in sys.argv[1:]:
         capture_output=True,
         text=True,
         check=True,
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
     )
     assert len(done.stdout.splitlines()) == 2
     assert done.stderr == ""

@@ -133,7 +133,7 @@ def test_every_classic_name_leads_to_a_field_of_ours():
 
 
 def test_the_page_of_parameters_is_up_to_date():
-    docs = Path(__file__).resolve().parents[1] / "docs"
+    docs = Path(__file__).resolve().parents[2] / "docs"
     spec = importlib.util.spec_from_file_location("parameters", docs / "parameters.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
