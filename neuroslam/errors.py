@@ -39,7 +39,7 @@ class SourceError(NeuroslamError, ValueError):
     """A video, folder, log or world that cannot be read, or a frame in it that cannot be used."""
 
 
-class BadFrame(SourceError):  # noqa: N818 - a frame is bad, the source is not
+class BadFrame(SourceError):
     """One frame that cannot be used; the ones after it may be, if the policy is to skip."""
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from neuroslam import cli
+from neuroslam.experiments import EXPERIMENTS
 from neuroslam.sensors import open_source
 from neuroslam.types import ViewMatch
 from neuroslam.view import vision
@@ -138,7 +139,7 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
     for line in commands(page):
         words = shlex.split(line, comments=True)[1:]
         if words[0] == "experiment":  # minutes or hours; each has small tests of its own
-            assert words[1] in cli.EXPERIMENTS
+            assert words[1] in EXPERIMENTS
             continue
         if frames := SHORT.get(words[1][:6]):
             words += ["--stop", frames]

@@ -78,6 +78,11 @@ def test_every_file_is_in_a_room_of_the_plan_and_no_room_has_a_second_floor():
         assert len(inside) <= 2, module
 
 
+def test_the_tests_mirror_the_rooms():
+    folders = {p.parent.name for p in Path(__file__).parent.rglob("test_*.py")} - {"tests"}
+    assert folders <= LEVEL.keys()
+
+
 def test_torchvision_is_imported_through_one_door():
     for path in ROOT.rglob("*.py"):
         if path.relative_to(ROOT) != Path("view/vision.py"):

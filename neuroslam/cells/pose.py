@@ -9,14 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuroslam.cells.attractor import (
-    Couplings,
-    couplings,
-    decode,
-    inject,
-    path_integrate,
-    settle,
-)
+from neuroslam.cells.attractor import Couplings, couplings, decode, inject, path_integrate, settle
 from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense, to_packet
 from neuroslam.cells.pose_joining import move_session
 from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all

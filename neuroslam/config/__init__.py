@@ -1,19 +1,8 @@
 """Every parameter of the brain: name, unit, bounds, what it does; files and presets to set them."""
 
-from neuroslam.config.brain import (
-    CLASSIC_NAMES,
-    BoundaryCellConfig,
-    BrainConfig,
-    GridCellConfig,
-    MapConfig,
-    OdometryConfig,
-    PlaceCellConfig,
-    PoseCellConfig,
-    Section,
-    SemanticConfig,
-    SessionConfig,
-    ViewConfig,
-    WallMemoryConfig,
+from neuroslam.config.brain import BrainConfig
+from neuroslam.config.classic import CLASSIC_NAMES
+from neuroslam.config.files import (
     build_config,
     merge_values,
     parse_assignment,
@@ -23,6 +12,19 @@ from neuroslam.config.brain import (
     read_preset,
     to_toml,
 )
+from neuroslam.config.sections import (
+    BoundaryCellConfig,
+    GridCellConfig,
+    MapConfig,
+    OdometryConfig,
+    PlaceCellConfig,
+    PoseCellConfig,
+    Section,
+    SessionConfig,
+    ViewConfig,
+    WallMemoryConfig,
+)
+from neuroslam.config.semantic import SemanticConfig
 
 __all__ = [
     "CLASSIC_NAMES",

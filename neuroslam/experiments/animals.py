@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.cells.navigation import NavigationCells, Whereabouts
+from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.worlds.rodent import Walk, read_walk
@@ -25,7 +25,7 @@ TRACKS = {
 RATE_HZ = 20.0
 WALLS = 2  # at most, that an animal feels at once: a corner's
 
-Hook = Callable[[int, Whereabouts, NavigationCells], object]
+Hook = Callable[[int, NavigationEstimate, NavigationCells], object]
 """Called after every step, with its number, what the cells say, and the cells."""
 
 
@@ -94,7 +94,7 @@ def live(
     estimate = np.empty((steps, len(seeds), 2))
     lost = np.empty((steps, len(seeds)), dtype=bool)
 
-    def note(i: int, here: Whereabouts, cells: NavigationCells) -> None:
+    def note(i: int, here: NavigationEstimate, cells: NavigationCells) -> None:
         estimate[i], lost[i] = here.position_m.numpy(), here.lost.numpy()
         if hook is not None:
             hook(i, here, cells)

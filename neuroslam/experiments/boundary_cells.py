@@ -13,18 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.cells.boundary import (
-    ATTENUATION,
-    GROWTH,
-    INHIBITION,
-    BoundaryCells,
-    boundary_zone,
-)
+from neuroslam.cells.boundary import ATTENUATION, GROWTH, INHIBITION, BoundaryCells, boundary_zone
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.evaluation.ratemap import Bins, rate_map
 from neuroslam.figures.cells import Approach, Firing, plot_approaches, plot_firing_maps
-from neuroslam.figures.maps import save
-from neuroslam.state.tables import write_atomically
+from neuroslam.figures.style import save
+from neuroslam.state.files import write_atomically
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.cells.navigation import NavigationCells, Whereabouts
+from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps, fields
@@ -126,7 +126,7 @@ def live_grid(
     shape = (len(seeds), len(config.grid_cells.spacings_m), config.grid_cells.n_cells)
     gatherer = Gatherer(walk, times_s, shape)
 
-    def hook(step: int, _here: Whereabouts, cells: NavigationCells) -> None:
+    def hook(step: int, _here: NavigationEstimate, cells: NavigationCells) -> None:
         gatherer.add(step, cells.grid.rates.numpy())
         if watch is not None:
             watch(step, cells)

@@ -14,7 +14,7 @@ from neuroslam.config import BrainConfig, build_config, merge_values, read_prese
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.figures.comparison import plot_comparison, plot_losses
-from neuroslam.figures.maps import save
+from neuroslam.figures.style import save
 from neuroslam.geometry import integrate_velocities
 from neuroslam.runs.parallel import one_thread, parallel_map
 from neuroslam.sensors import open_source

@@ -26,8 +26,7 @@ from neuroslam.experiments.census import (
     median_cell,
 )
 from neuroslam.figures.cells import Curve, Firing, plot_firing, plot_scores
-from neuroslam.figures.maps import save
-from neuroslam.figures.style import CURVES, MAP, TRUTH
+from neuroslam.figures.style import CURVES, MAP, TRUTH, save
 from neuroslam.worlds.rodent import Walk, read_walk
 
 PAPER_TABLE_1 = {

@@ -30,8 +30,7 @@ from neuroslam.experiments.census import (
     median_cell,
 )
 from neuroslam.figures.cells import Curve, Firing, plot_encounters, plot_grids, plot_scores
-from neuroslam.figures.maps import save
-from neuroslam.figures.style import CURVES, LOOP, MAP, ROBOT, TRUTH
+from neuroslam.figures.style import CURVES, LOOP, MAP, ROBOT, TRUTH, save
 from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, Senses, sense
 

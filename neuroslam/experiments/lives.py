@@ -13,7 +13,7 @@ from neuroslam.evaluation.trajectory import absolute_trajectory_error, shape_rms
 from neuroslam.figures.sessions import Bindings, Stage
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.tables import closes_loop
-from neuroslam.runs.files import trajectory
+from neuroslam.runs.reading import trajectory
 from neuroslam.types import Frame
 
 _TRACE = ("session", "number", "dx_m", "dy_m", "dtheta_rad", "truth_x_m", "truth_y_m")

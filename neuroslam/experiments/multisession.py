@@ -17,11 +17,11 @@ from neuroslam.config import BrainConfig, build_config, merge_values, read_prese
 from neuroslam.evaluation.icp import map_rmse
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.lives import Life, bindings, live, measure, stages, track
-from neuroslam.figures.maps import save
 from neuroslam.figures.sessions import plot_accuracy, plot_bindings, plot_overlay, plot_stages
+from neuroslam.figures.style import save
 from neuroslam.merging.match import find_match
 from neuroslam.sensors import Source, open_source
-from neuroslam.state.tables import write_atomically
+from neuroslam.state.files import write_atomically
 
 Cut = tuple[int, int]
 """First frame of a session, and the frame before which it ends."""
@@ -42,7 +42,7 @@ class Plan(NamedTuple):
     title: str
     source: str
     cuts: Callable[[Source], list[Cut]]
-    config: dict[str, Any] = {}  # noqa: RUF012
+    config: dict[str, Any] = {}
     paper_rmse: float = math.nan
     preset: str = ""
 

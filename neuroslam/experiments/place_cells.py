@@ -42,7 +42,6 @@ from neuroslam.experiments.place_lives import (
     TrackResult,
     run_track,
 )
-from neuroslam.figures.maps import save
 from neuroslam.figures.places import (
     PathTold,
     PlaceMap,
@@ -55,8 +54,9 @@ from neuroslam.figures.places import (
     plot_responses,
     plot_sweep,
 )
+from neuroslam.figures.style import save
 from neuroslam.runs.parallel import parallel_map
-from neuroslam.state.tables import write_atomically
+from neuroslam.state.files import write_atomically
 from neuroslam.worlds.senses import SenseNoise, sense
 
 PAPER = {

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from neuroslam.cells.boundary_vectors import Wall
-from neuroslam.cells.navigation import NavigationCells, Whereabouts
+from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.evaluation.ratemap import responding
@@ -83,7 +83,7 @@ class Diary:
         self.above: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
         self.looks: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
-    def __call__(self, i: int, here: Whereabouts, cells: NavigationCells) -> None:
+    def __call__(self, i: int, here: NavigationEstimate, cells: NavigationCells) -> None:
         """Write down a step; a :data:`~neuroslam.experiments.animals.Hook`."""
         self.estimate[i], self.lost[i] = here.position_m.numpy(), here.lost.numpy()
         self.winner[i] = cells.place.centre_of(here.place).numpy()
@@ -98,7 +98,7 @@ class Diary:
         if i % _LOOK_EVERY == 0 and len(beside):
             self._look(i, here, cells, beside)
 
-    def _look(self, i: int, here: Whereabouts, cells: NavigationCells, beside: np.ndarray) -> None:
+    def _look(self, i: int, here: NavigationEstimate, cells: NavigationCells, beside: np.ndarray) -> None:
         grid = cells.grid.rates.flatten(-2)
         both = [cells.place.responses(grid, at).numpy() for at in (here.position_m, None)]
         for above, rates in zip(self.above, both, strict=True):

@@ -18,8 +18,8 @@ from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.ssp_lives import slam_in, views
-from neuroslam.figures.maps import save
 from neuroslam.figures.spikes import Headings, Spikes, plot_rasters, plot_signals, plot_spikes
+from neuroslam.figures.style import save
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.worlds.landmark_paths import LandmarkPath, path_of_walk
 from neuroslam.worlds.landmarks import LandmarkWorld, random_world
@@ -63,7 +63,7 @@ class Watched:
         self.signals: list[tuple[float, float, float]] = []
         self._fired: list[np.ndarray] = []
 
-    def __call__(self, step: int, said: Any) -> None:  # noqa: ANN401 - a step of SSP-SLAM
+    def __call__(self, step: int, said: Any) -> None:
         """Take a step."""
         fired = {name: array.spikes for name, array in populations(self.slam).items()}
         self._fired.append(fired["grid cells"][0, 0].numpy().astype(bool))

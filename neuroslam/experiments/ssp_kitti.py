@@ -8,8 +8,8 @@ import torch
 
 from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig, SSPSpaceConfig
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.figures.maps import save
 from neuroslam.figures.spikes import Run, plot_dead_reckoning
+from neuroslam.figures.style import save
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.quantise import quantised
 from neuroslam.spiking.space import SSPSpace

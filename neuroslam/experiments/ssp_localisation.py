@@ -7,16 +7,9 @@ import numpy as np
 
 from neuroslam.config.semantic import PathIntegratorConfig, SSPSLAMConfig, SSPSpaceConfig
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.ssp_lives import (
-    Life,
-    integrate,
-    live,
-    recalled,
-    slam_in,
-    trials,
-)
-from neuroslam.figures.maps import save
+from neuroslam.experiments.ssp_lives import Life, integrate, live, recalled, slam_in, trials
 from neuroslam.figures.spikes import plot_3d, plot_errors, plot_trials
+from neuroslam.figures.style import save
 from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
 from neuroslam.worlds.landmarks import LandmarkWorld, random_world
 

@@ -15,7 +15,7 @@ from neuroslam.config.semantic import (
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.ssp_lives import live, pointers_of, recalled, slam_in, views
 from neuroslam.figures.landmarks import Query, plot_area, plot_posterior, plot_queries, plot_vectors
-from neuroslam.figures.maps import save
+from neuroslam.figures.style import save
 from neuroslam.spiking import queries
 from neuroslam.spiking.decoding import probability
 from neuroslam.spiking.slam import SSPSLAM

@@ -22,10 +22,10 @@ from neuroslam.evaluation.place import (
     precision_recall,
     recall_at_full_precision,
 )
-from neuroslam.figures.maps import plot_precision_recall, save
-from neuroslam.figures.style import STYLE, write_title
+from neuroslam.figures.maps import plot_precision_recall
+from neuroslam.figures.style import STYLE, save, write_title
 from neuroslam.sensors import open_source
-from neuroslam.state.tables import write_atomically
+from neuroslam.state.files import write_atomically
 from neuroslam.view import LocalViewCells
 from neuroslam.view.search import distances as sums_of_differences
 from neuroslam.view.templates import to_bytes

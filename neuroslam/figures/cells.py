@@ -1,6 +1,6 @@
 """Figures of animals in arenas: walls, boundary cells, firing maps of grid cells, their scores.
 
-Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.maps.save` writes it.
+Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.style.save` writes it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,57 +1,35 @@
-"""Figures of maps, cells, views and curves: plain arrays in, a matplotlib ``Figure`` out.
+"""Figures of maps, cells, views and curves, whole: plain arrays in, a matplotlib ``Figure`` out.
 
 :mod:`neuroslam.figures.style` has the colours and what they mean. pyplot is never touched.
 """
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from neuroslam.figures.style import (
-    CURVES,
-    STYLE,
-    as_rgb,
-    counted,
+from neuroslam.errors import counted
+from neuroslam.figures.parts import (
     draw_frame,
     draw_map,
     draw_odometry,
     draw_pose_cells,
     draw_signals,
     draw_template,
+)
+from neuroslam.figures.style import (
+    CURVES,
+    STYLE,
+    as_rgb,
     legend_below,
     new_figure,
     write_title,
 )
-from neuroslam.state.tables import write_atomically
 from neuroslam.types import Pose, PoseEstimate
 from neuroslam.view import vision
-
-
-def save(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a figure as PNG, whole or not at all; equal figures give equal bytes."""
-    with mpl.rc_context(STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # a name in a script that no font has
-        write_atomically(
-            Path(path),
-            lambda file: figure.savefig(
-                file, format="png", dpi=dpi, metadata={"Software": "neuroslam"}
-            ),
-        )
-
-
-def render(figure: Figure, dpi: int = 100) -> np.ndarray:
-    """Draw a figure into pixels: ``uint8``, ``(h, w, 3)``."""
-    figure.set_dpi(dpi)
-    with mpl.rc_context(STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")
-        figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
 def plot_map(

@@ -17,8 +17,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from neuroslam.errors import counted
 from neuroslam.evaluation.trajectory import path_length
 from neuroslam.figures.cells import draw_arena
+from neuroslam.figures.parts import draw_robot
 from neuroslam.figures.style import (
     ACTIVITY,
     CURVES,
@@ -28,8 +30,6 @@ from neuroslam.figures.style import (
     ODOMETRY,
     STYLE,
     TRUTH,
-    counted,
-    draw_robot,
     legend_below,
     new_figure,
     write_title,

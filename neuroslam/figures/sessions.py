@@ -1,7 +1,7 @@
 """Figures of mapping in several sessions: maps before and after a merge, and what it cost.
 
 A colour is a session, a cross its start, a diamond its end, a red ring the match that joins two
-maps. Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.maps.save` writes it.
+maps. Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.style.save` writes it.
 """
 
 import math

@@ -25,14 +25,7 @@ from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.population import Action, Correction
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import (
-    NO_EXPERIENCE,
-    NO_TEMPLATE,
-    Motion,
-    Pose,
-    PoseEstimate,
-    ViewMatch,
-)
+from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Motion, Pose, PoseEstimate, ViewMatch
 
 
 def choose_action(

@@ -14,7 +14,8 @@ from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.merge import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
-from neuroslam.runs.files import TIMINGS, odometry_track, places_of, trajectory, true_poses
+from neuroslam.runs.files import TIMINGS
+from neuroslam.runs.reading import odometry_track, places_of, trajectory, true_poses
 
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000

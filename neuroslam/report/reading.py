@@ -8,9 +8,8 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import NeuroslamError, RunError
-from neuroslam.runs.files import (
-    RunPlan,
-    brain_file,
+from neuroslam.runs.files import RunPlan, brain_file
+from neuroslam.runs.reading import (
     frame_rows,
     read_actions,
     read_frames,

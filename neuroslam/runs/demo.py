@@ -8,17 +8,13 @@ import numpy as np
 from neuroslam.brain import load_brain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
-from neuroslam.figures.maps import plot_summary, save
+from neuroslam.figures.maps import plot_summary
 from neuroslam.figures.sessions import Stage, plot_stages
-from neuroslam.runs.files import (
-    odometry_track,
-    read_frames,
-    read_plan,
-    read_trace,
-    require_free,
-    trajectory,
-)
-from neuroslam.runs.run import RunSummary, run
+from neuroslam.figures.style import save
+from neuroslam.runs.files import require_free
+from neuroslam.runs.reading import odometry_track, read_frames, read_plan, read_trace, trajectory
+from neuroslam.runs.results import RunSummary
+from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
 from neuroslam.types import StepResult
 

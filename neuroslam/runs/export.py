@@ -10,10 +10,11 @@ import numpy as np
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
-from neuroslam.runs.files import brain_file, track_file
+from neuroslam.runs.files import brain_file
+from neuroslam.runs.reading import track_file
 from neuroslam.spiking.export import export_nir
+from neuroslam.state.files import write_atomically
 from neuroslam.state.sessions import session_name
-from neuroslam.state.tables import write_atomically
 
 
 def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:

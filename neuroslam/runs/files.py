@@ -5,22 +5,18 @@ import json
 import math
 import os
 import shutil
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice, takewhile
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TextIO
+from typing import BinaryIO, Literal, TextIO
 
 import numpy as np
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, counted
-from neuroslam.geometry import integrate_velocities, wrap_angles
-from neuroslam.mapping.tables import Links, origin_key
-from neuroslam.state.tables import write_atomically
-from neuroslam.types import NO_EXPERIENCE, Frame, Pose, StepResult
+from neuroslam.mapping.tables import Links
+from neuroslam.state.files import write_atomically
+from neuroslam.types import Frame, StepResult
 
 FRAME_COLUMNS = (
     "frame,time_s,v_m_s,w_rad_s,template,match_error,relative_heading_rad,action,experience,"
@@ -39,8 +35,6 @@ RUN_FILES = (
 )  # fmt: skip
 LANDMARKS_FILE = "landmarks.csv"
 """Besides, where the brain has a semantic map."""
-
-_FIGURES = ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges")
 
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
 """Figures of a run that differ from one time to the next; all others do not."""
@@ -109,23 +103,6 @@ def refuse_many(out: Path) -> None:
     raise RunError(f"{out}: is {what}")
 
 
-def track_file(out: Path) -> Path:
-    """Return the track of a run, which is written at its end.
-
-    Raises:
-        RunError: If the run was killed before.
-    """
-    refuse_many(out)
-    track = out / "trajectory.tum"
-    if (
-        not track.exists()
-        and (out / "brain.safetensors").exists()
-        and (out / "frames.csv").exists()
-    ):
-        raise RunError(f"{out}: was cut off before its end; go on with: neuroslam resume {out}")
-    return track
-
-
 def require_free(out: Path, source: str, overwrite: bool) -> None:
     """Make sure that a new run in a folder destroys nothing that it should not.
 
@@ -174,7 +151,7 @@ class RowWriter:
             ):
                 frames.readline()
                 for done in range(rows):
-                    if not _is_whole(frames.readline()):
+                    if not is_whole(frames.readline()):
                         raise RunError(f"{missing_rows(out, done, rows)}; cannot resume")
                 frames.seek(frames.tell())
                 frames.truncate()
@@ -223,83 +200,6 @@ def _remove_halves(out: Path) -> None:
             half.unlink(missing_ok=True)
 
 
-def read_trace(
-    out: str | Path, rows: int | None = None, min_rows: int = 1
-) -> dict[str, np.ndarray]:
-    """Read ``trace.f64`` of a run: one array for each of ``TRACE_COLUMNS``.
-
-    Args:
-        out: Folder of the run.
-        rows: So many, without what a killed run wrote after its last save; ``None``: all.
-        min_rows: It must have so many.
-
-    Raises:
-        RunError: If there is none, or it has fewer rows.
-    """
-    path = Path(out) / "trace.f64"
-    if not path.is_file():
-        raise RunError(f"{path}: missing; is {out} a run?")
-    values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
-    there = len(values) // width
-    if not path.stat().st_size and (rows or min_rows):
-        raise RunError(f"{path}: holds no frames; was it merged from brain files alone?")
-    if there < (rows or min_rows):
-        raise RunError(f"{path}: damaged, {there} whole rows; expected {rows or 'some'}")
-    table = values[: (rows or there) * width].reshape(-1, width)
-    return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
-
-
-def places_of(
-    brain: NavigationBrain, trace: dict[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find where every frame was, on the final map.
-
-    Returns:
-        Id of the experience as it is now, ``(frames,)``, -1 where it is not of this map or there
-        was none yet; and the heading that the experience was made with, minus the heading of what
-        it is now, in radians, ``(frames,)``.
-    """
-    origins = brain.map.origins()
-    keys = origin_key(origins._asdict())
-    own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
-    place, turn_rad = np.full(len(own), NO_EXPERIENCE), np.zeros(len(own))
-    if len(keys):
-        order = np.argsort(keys)
-        found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
-        known = (keys[found] == own) & (trace["number"] >= 0)
-        place[known] = origins.experience[found[known]]
-        turn_rad[known] = origins.turn_rad[found[known]]
-    return place, turn_rad
-
-
-def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
-    """Place every frame on the final map: each keeps its offset from its experience.
-
-    The trace may be of any session that the map holds.
-
-    Returns:
-        x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the frame's place
-        is not of this map: it is of a stored one that was not joined.
-    """
-    place, turn_rad = places_of(brain, trace)
-    on_map = place >= 0
-    at = np.full((len(place), 3), np.nan)
-    at[on_map] = brain.map.poses[place[on_map]]
-    at[:, 2] += turn_rad
-    if not brain.sessions.merges:
-        at[trace["number"] < 0] = 0.0  # before the first experience
-    c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
-    x = at[:, 0] + c * trace["dx_m"] - s * trace["dy_m"]
-    y = at[:, 1] + s * trace["dx_m"] + c * trace["dy_m"]
-    return np.column_stack([x, y, wrap_angles(at[:, 2] + trace["dtheta_rad"])])
-
-
-def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndarray:
-    """Dead-reckon the run's odometry from the map's start; shape ``(frames, 3)``."""
-    start = Pose(0.0, 0.0, math.radians(config.map.initial_heading_deg))
-    return integrate_velocities(trace["v_m_s"], trace["w_rad_s"], trace["dt_s"], start)
-
-
 def experiences_csv(brain: NavigationBrain) -> str:
     """Write the experiences as CSV: id,x_m,y_m,theta_rad,template,first_frame."""
     table = brain.map.experiences
@@ -334,27 +234,8 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
-def frame_rows(out: str | Path, rows: int | None = None) -> list[str]:
-    """Read the whole rows of ``frames.csv``, those before the first that was cut off, as text.
-
-    Args:
-        out: Folder of the run.
-        rows: No more than so many.
-
-    Raises:
-        RunError: If there is none, or it is not text.
-    """
-    path = Path(out) / "frames.csv"
-    try:
-        with path.open(encoding="utf-8") as file:
-            return list(takewhile(_is_whole, islice(file, 1, None if rows is None else rows + 1)))
-    except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: damaged ({error})") from None
-
-
-def _is_whole(line: str) -> bool:
+def is_whole(line: str) -> bool:
+    """Say whether a row of ``frames.csv`` was not cut off."""
     return line.endswith("\n") and line.count(",") == FRAME_COLUMNS.count(",")
 
 
@@ -364,98 +245,3 @@ def missing_rows(out: str | Path, there: int, seen: int) -> str:
         f"{Path(out) / 'frames.csv'}: damaged, {counted(there, 'whole row')}; "
         f"the brain has seen {counted(seen, 'frame')}"
     )
-
-
-def _all_rows(out: str | Path, rows: int | None) -> list[str]:
-    lines = frame_rows(out, rows)
-    if rows is not None and len(lines) < rows:
-        raise RunError(missing_rows(out, len(lines), rows))
-    return lines
-
-
-def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
-    """Read the columns of ``frames.csv`` that hold numbers, each as an array.
-
-    Args:
-        out: Folder of the run.
-        rows: So many, as for :func:`read_trace`; ``None``: all that are whole.
-
-    Raises:
-        RunError: If there is none, or it is damaged.
-    """
-    names = FRAME_COLUMNS.split(",")
-    numbers = [i for i, name in enumerate(names) if name != "action"]
-    lines = _all_rows(out, rows)
-    if not lines:
-        return {names[i]: np.zeros(0) for i in numbers}
-    try:
-        table = np.loadtxt(lines, delimiter=",", usecols=numbers, ndmin=2)
-    except ValueError as error:
-        raise RunError(f"{Path(out) / 'frames.csv'}: damaged ({error})") from None
-    return {names[i]: table[:, column] for column, i in enumerate(numbers)}
-
-
-def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:
-    """Read the column of ``frames.csv`` that is no number: what was done, as text ``(frames,)``.
-
-    Args:
-        out: Folder of the run.
-        rows: As for :func:`read_frames`.
-
-    Raises:
-        RunError: As :func:`read_frames`.
-    """
-    column = FRAME_COLUMNS.split(",").index("action")
-    return np.array([line.split(",")[column] for line in _all_rows(out, rows)], dtype=np.str_)
-
-
-def read_plan(out: str | Path) -> RunPlan:
-    """Read what a run was made from, out of its ``config.toml``.
-
-    Raises:
-        RunError: If the folder holds no run.
-    """
-    refuse_many(Path(out))
-    path = Path(out) / "config.toml"
-    if (Path(out) / "frames.csv").exists() and not any(
-        (Path(out) / name).exists() for name in RUN_FILES[4:]
-    ):
-        raise RunError(
-            f"{out}: was cut off before anything was saved; run it again with --overwrite"
-        )
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
-        return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
-    except OSError:
-        if (Path(out) / "brain.safetensors").exists():
-            raise RunError(
-                f"{path}: is missing, and says what the run reads; put it back. The map is in "
-                f"{Path(out) / 'brain.safetensors'}, which can be used alone"
-            ) from None
-        raise RunError(f"{out}: not a run, it has no config.toml") from None
-    except (KeyError, TypeError, ValueError):  # not TOML, not text, or not of a run
-        raise RunError(f"{path}: has no usable [run] table; is it of a run?") from None
-
-
-def read_metrics(out: str | Path) -> dict[str, Any]:
-    """Read the figures of a run.
-
-    Raises:
-        RunError: If there are none, or they are damaged.
-    """
-    path = Path(out) / "metrics.json"
-    try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        for name in _FIGURES:
-            metrics[name]
-    except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{path}: damaged ({error})") from None
-    return metrics
-
-
-def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return the true pose of every frame, ``(frames, 3)``, or ``None`` where it is not known."""
-    truth = np.column_stack([trace[f"truth_{name}"] for name in ("x_m", "y_m", "theta_rad")])
-    return truth if np.isfinite(truth).all() else None

@@ -15,21 +15,12 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError, NeuroslamError, RunError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.figures.maps import save
 from neuroslam.figures.sessions import Stage, plot_stages
-from neuroslam.figures.style import SESSIONS, plain_text, shortened
-from neuroslam.runs.files import (
-    OnBadFrame,
-    RunPlan,
-    brain_file,
-    read_trace,
-    require_free,
-    trajectory,
-    true_poses,
-    write_text,
-)
+from neuroslam.figures.style import SESSIONS, plain_text, save, shortened
+from neuroslam.runs.files import OnBadFrame, RunPlan, brain_file, require_free, write_text
 from neuroslam.runs.merge import merge_runs
 from neuroslam.runs.parallel import outcomes
+from neuroslam.runs.reading import read_trace, trajectory, true_poses
 from neuroslam.runs.sweep import claim, run_one, told
 from neuroslam.sensors.open import absolute_spec
 

@@ -17,11 +17,11 @@ from neuroslam.runs.files import (
     RUN_FILES,
     RunPlan,
     brain_file,
-    read_plan,
     require_free,
 )
 from neuroslam.runs.parallel import one_thread
-from neuroslam.runs.run import RunSummary, write_results
+from neuroslam.runs.reading import read_plan
+from neuroslam.runs.results import RunSummary, write_results
 
 _REST_LOOPS = 5000
 """Most loops in which the merged map is relaxed; a large map goes on relaxing when it is used."""

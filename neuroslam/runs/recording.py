@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from neuroslam.errors import RunError
-from neuroslam.figures.maps import plot_map, render
+from neuroslam.figures.maps import plot_map
+from neuroslam.figures.style import render
 from neuroslam.runs.panels import CellPanels
 from neuroslam.types import Frame, StepResult
 

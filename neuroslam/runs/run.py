@@ -1,22 +1,19 @@
 """A run: a source goes through a brain, and its files are written as it goes."""
 
 import contextlib
-import json
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
-from neuroslam.brain import NavigationBrain, load_brain, save_brain
+from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import (
     BrainConfig,
     build_config,
@@ -24,81 +21,19 @@ from neuroslam.config import (
     parse_assignment,
     read_config_file,
     read_preset,
-    to_toml,
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
-from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
-from neuroslam.mapping.tables import closes_loop
-from neuroslam.runs.files import (
-    LANDMARKS_FILE,
-    OnBadFrame,
-    RowWriter,
-    RunPlan,
-    brain_file,
-    experiences_csv,
-    landmarks_csv,
-    links_csv,
-    odometry_track,
-    read_metrics,
-    read_plan,
-    read_trace,
-    require_free,
-    trajectory,
-    true_poses,
-    write_text,
-)
+from neuroslam.runs.files import OnBadFrame, RowWriter, RunPlan, brain_file, require_free
 from neuroslam.runs.parallel import one_thread
+from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
-from neuroslam.runs.review import draw_map
+from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
 from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
 """Of the clock on the wall; what a killed run may lose."""
-
-
-@dataclass
-class RunSummary:
-    """What a run did: the content of ``metrics.json``, and how many frames it took in just now."""
-
-    frames: int = 0
-    added: int = 0
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    skipped: list[str] = field(default_factory=list)
-    unused: list[str] = field(default_factory=list)
-    pictures: bool = False
-    interrupted: bool = False
-    counts: dict[str, float] = field(default_factory=dict)
-    accuracy: dict[str, float] = field(default_factory=dict)
-    merges: list[dict[str, Any]] = field(default_factory=list)
-    refusals: list[dict[str, Any]] = field(default_factory=list)
-    not_joined: list[dict[str, Any]] = field(default_factory=list)
-    unplaced: int = 0
-    failure: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Name every figure with its unit."""
-        return {
-            "frames": self.frames,
-            "seconds": self.seconds,
-            "cpu_seconds": self.cpu_seconds,
-            "frames_per_s": self.frames / self.seconds if self.seconds else 0.0,
-            "frames_per_cpu_s": self.frames / self.cpu_seconds if self.cpu_seconds else 0.0,
-            **self.counts,
-            "merges": len(self.merges),
-            "merge_reports": self.merges,
-            "refused_merges": self.refusals,
-            "not_joined": self.not_joined,
-            "frames_on_no_joined_map": self.unplaced,
-            "skipped_frames": len(self.skipped),
-            "skipped": self.skipped,
-            "unused": self.unused,
-            "pictures": self.pictures,
-            "interrupted": self.interrupted,
-            **self.accuracy,
-        }
 
 
 def resolve_config(
@@ -252,7 +187,7 @@ def resume(
     if stop is not None and stop < first:
         raise RunError(f"{out}: is at frame {first} already; --stop {stop} is behind that")
     opened = open_source(plan.source, brain.config.frame_rate_hz)
-    summary = _read_summary(out)
+    summary = read_summary(out)
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
     with one_thread(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
@@ -342,17 +277,10 @@ def _keeper(
         if every_s and time.monotonic() - saved >= every_s:
             output.flush()  # a brain must not have seen frames that have no row
             so_far = replace(summary, frames=brain.clock.frames_seen, interrupted=True)
-            _save(brain, plan, out, so_far)
+            save_run(brain, plan, out, so_far)
             saved = time.monotonic()
 
     return keep
-
-
-def _save(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> None:
-    """Write what a run goes on from."""
-    write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
-    write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
-    save_brain(brain, out / "brain.safetensors")
 
 
 def _and_why(skipped: list[str]) -> str:
@@ -387,71 +315,6 @@ def _asked_to_stop() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def write_results(
-    brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary
-) -> RunSummary:
-    """Write what a brain and its trace tell, as the files of a run.
-
-    Args:
-        brain: At the end of the run.
-        plan: What it read.
-        out: Folder that holds ``trace.f64``.
-        summary: So far; it is completed.
-
-    Raises:
-        RunError: If the folder cannot be written.
-    """
-    trace = read_trace(out, min_rows=0)
-    track = trajectory(brain, trace)
-    truth = true_poses(trace)
-    odometry = odometry_track(brain.config, trace)
-    on_map = np.isfinite(track[:, 0])
-    summary.unplaced = int((~on_map).sum())
-    drive = brain.sessions.this_drive() if brain.sessions.sessions else set()
-    for name in ("merges", "refusals"):
-        reports = getattr(brain.sessions, name)
-        setattr(summary, name, [r for r in reports if r["partial_sessions"][-1] in drive])
-    summary.not_joined = brain.not_joined()
-    summary.frames = brain.clock.frames_seen
-    summary.counts = {
-        "templates": brain.view.n,
-        "experiences": brain.map.n,
-        "links": brain.map.n_links,
-        "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
-    }
-    if brain.config.has("place"):
-        cells = brain.navigation
-        summary.counts |= {
-            "place_cells": int(cells.place.n_cells),
-            "walls": int(cells.walls.n_walls),
-            "activated_boundary_cells": int(cells.familiarity.n_activated()),
-            "lost_s": round(cells.now.lost_s, 3),
-        }
-    if brain.config.has("semantic"):
-        summary.counts["landmarks"] = brain.semantic.n
-    if truth is not None:
-        # A robot that has not moved: nothing tells how to lay its track over the truth.
-        with contextlib.suppress(MapError):
-            summary.accuracy = {
-                f"{name}_rmse_m": absolute_trajectory_error(
-                    xy[on_map, :2], truth[on_map, :2], "rigid"
-                ).rmse
-                for name, xy in (("ate", track), ("odometry_ate", odometry))
-            }
-    try:
-        # What cannot be made again comes first: one who kills the run now can still resume it.
-        _save(brain, plan, out, summary)
-        write_text(out / "experiences.csv", experiences_csv(brain))
-        write_text(out / "links.csv", links_csv(brain.map.links))
-        if brain.config.has("semantic"):
-            write_text(out / LANDMARKS_FILE, landmarks_csv(brain))
-        write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
-        draw_map(brain, plan, trace, out / "map.png")
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
-    return summary
-
-
 def _located(config: BrainConfig) -> BrainConfig:
     """Say where a network's weights lie from anywhere: a run may be resumed in another folder."""
     if config.view.weights is None:
@@ -475,13 +338,3 @@ def recorded(source: str) -> str:
     if not path.exists():  # made on the fly, or of two recordings
         return ""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()
-
-
-def _read_summary(out: Path) -> RunSummary:
-    old = read_metrics(out)
-    return RunSummary(
-        seconds=float(old["seconds"]),
-        cpu_seconds=float(old["cpu_seconds"]),
-        skipped=list(old["skipped"]),
-        pictures=bool(old.get("pictures")),
-    )

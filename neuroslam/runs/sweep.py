@@ -14,7 +14,7 @@ from typing import Any
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
-from neuroslam.figures.maps import save
+from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
@@ -269,7 +269,7 @@ def _map(order: _Order) -> dict[str, Any]:
     return run_one(trial.source, order.out / trial.name, trial.config, **given)
 
 
-def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:  # noqa: ANN401
+def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:
     """Make one run of many; arguments are those of :func:`neuroslam.runs.run.run`.
 
     Returns:

@@ -8,13 +8,7 @@ from pathlib import Path
 from neuroslam.errors import SourceError
 from neuroslam.sensors.camera import CameraSource
 from neuroslam.sensors.datasets import open_dataset
-from neuroslam.sensors.images import (
-    is_picture,
-    open_folder,
-    open_image_list,
-    open_tar,
-    read_text,
-)
+from neuroslam.sensors.images import is_picture, open_folder, open_image_list, open_tar, read_text
 from neuroslam.sensors.rosbag import is_bag, open_bag
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams

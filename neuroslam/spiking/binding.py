@@ -6,13 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import (
-    NeuronArray,
-    lowpass,
-    sample_tuning,
-    solve_decoders,
-    synapse,
-)
+from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 1000

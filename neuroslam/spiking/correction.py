@@ -5,13 +5,7 @@ from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.binding import SpikingBinding
-from neuroslam.spiking.ensemble import (
-    NeuronArray,
-    lowpass,
-    sample_tuning,
-    solve_decoders,
-    synapse,
-)
+from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000

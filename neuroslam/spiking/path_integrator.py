@@ -8,13 +8,7 @@ from torch import Tensor
 from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.decoding import PositionDecoder
-from neuroslam.spiking.ensemble import (
-    NeuronArray,
-    lowpass,
-    sample_tuning,
-    solve_decoders,
-    synapse,
-)
+from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.state.mergeable import BufferModule
 

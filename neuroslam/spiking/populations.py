@@ -4,13 +4,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import (
-    NeuronArray,
-    lowpass,
-    sample_tuning,
-    solve_decoders,
-    synapse,
-)
+from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.state.mergeable import BufferModule
 

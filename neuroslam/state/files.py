@@ -1,8 +1,11 @@
-"""Files that say whether they are whole: safetensors with a config and a checksum. No pickle."""
+"""Files that are written whole or not at all: safetensors with config and checksum. No pickle."""
 
 import hashlib
 import json
+import os
 import struct
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +14,34 @@ from safetensors.torch import save_file
 from torch import Tensor, uint8
 
 from neuroslam.errors import CheckpointError
-from neuroslam.state.tables import write_atomically
 
 _KEY = "neuroslam"  # one metadata key: safetensors does not keep the order of several
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside ``path``, flush it to the disk, and only then give it its name.
+
+    Whatever goes wrong, ``path`` is the old file or the new one, never a part of one.
+
+    Args:
+        path: The file to write or to replace.
+        write: Writes the content to the path it is given.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes it private; a result is not
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def tensors_digest(tensors: dict[str, Tensor]) -> str:
@@ -62,7 +90,7 @@ def load_checked(
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError) as error:
         _say_if_a_pickle(path, kind)
         raise CheckpointError(

@@ -238,7 +238,7 @@ class Population(Mergeable):
         raise NotImplementedError(f"{type(self).__name__} cannot lead")
 
     @property
-    def estimate(self) -> Any:  # noqa: ANN401 - of a batch it is a tensor
+    def estimate(self) -> Any:
         """Where the cells have the robot: columns ``pose_x``, ``pose_y``, ``pose_theta``."""
         raise NotImplementedError(f"{type(self).__name__} cannot lead")
 

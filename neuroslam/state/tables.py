@@ -1,9 +1,4 @@
-"""State that grows or changes every frame, and files that are written whole or not at all."""
-
-import os
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
+"""State that grows or changes every frame: tables of rows, and named numbers."""
 
 import torch
 from torch import Tensor, nn
@@ -149,29 +144,3 @@ def _read_scalars(
             missing_keys.append(prefix + name)
         else:
             setattr(module, name, kind(saved.item()))
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside ``path``, flush it to the disk, and only then give it its name.
-
-    Whatever goes wrong, ``path`` is the old file or the new one, never a part of one.
-
-    Args:
-        path: The file to write or to replace.
-        write: Writes the content to the path it is given.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes it private; a result is not
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

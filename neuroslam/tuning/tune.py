@@ -13,7 +13,7 @@ from torch import nn
 from neuroslam.config import BrainConfig, to_toml
 from neuroslam.config.sections import ViewConfig
 from neuroslam.errors import RunError, counted
-from neuroslam.figures.maps import save
+from neuroslam.figures.style import save
 from neuroslam.figures.tuning import plot_tuning
 from neuroslam.runs.files import write_text
 from neuroslam.runs.parallel import one_thread

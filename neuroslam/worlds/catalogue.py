@@ -10,14 +10,7 @@ import numpy as np
 from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
 from neuroslam.worlds import paint, paint_outdoors
-from neuroslam.worlds.scene import (
-    Route,
-    Sense,
-    Surface,
-    World,
-    ellipse_route,
-    rounded_route,
-)
+from neuroslam.worlds.scene import Route, Sense, Surface, World, ellipse_route, rounded_route
 from neuroslam.worlds.site import Painter, Point, Site
 
 

@@ -9,11 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI, wrap_angles
-from neuroslam.sensors.markers import in_sight, with_markers
 from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame, Pose, Velocity
 from neuroslam.worlds.catalogue import build_world, catalogue
+from neuroslam.worlds.posts import in_sight, with_markers
 from neuroslam.worlds.render import Camera, measure_ranges, render
 from neuroslam.worlds.rodent import ornstein_uhlenbeck
 from neuroslam.worlds.scene import Billboard, World

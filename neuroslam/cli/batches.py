@@ -1,0 +1,183 @@
+"""Commands that make many runs: sweep, fleet, experiment."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from neuroslam.cli.options import (
+    Assignments,
+    BadFrame,
+    ConfigFile,
+    Confirm,
+    Jobs,
+    OnBadFrame,
+    Out,
+    Overwrite,
+    Preset,
+    RayAddress,
+    Sources,
+    Start,
+    Stop,
+)
+from neuroslam.cli.output import REFUSED, USER_ERROR, complain, say
+from neuroslam.cli.progress import show_runs
+from neuroslam.cli.tables import across, down
+from neuroslam.errors import ConfigError, counted
+from neuroslam.experiments import EXPERIMENTS
+
+
+def sweep_command(
+    sources: Sources,
+    out: Out,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=A,B,C", help="As view.threshold=0.03,0.05; several are allowed."),
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, help="So many runs of each, with other noise and random weights."),
+    ] = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    start: Start = 0,
+    stop: Stop = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Map sources with all values of what is varied; exit 2 if a run failed."""
+    from neuroslam.runs.sweep import given, sweep
+
+    so_far = (0, 0)
+
+    def note(*done_and_total: int) -> None:
+        nonlocal so_far
+        so_far = done_and_total
+        on_done("runs", *so_far)
+
+    with show_runs("sweep") as on_done:
+        try:
+            rows = sweep(
+                sources,
+                out,
+                vary=vary or (),
+                seeds=seeds,
+                preset=preset,
+                config=config,
+                assignments=assignments or (),
+                start=start,
+                stop=stop,
+                on_bad_frame=on_bad_frame.value,
+                jobs=jobs,
+                ray=ray,
+                overwrite=overwrite,
+                on_done=note,
+            )
+        except KeyboardInterrupt:
+            if so_far[0]:
+                done, total = so_far
+                say(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
+            raise
+    figures = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
+    keys = [*given(rows), *(key for key in figures if any(row.get(key) for row in rows))]
+    say(down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
+    failed = [row for row in rows if row["error"]]
+    for row in failed:
+        complain("sweep", f"{row['run']}: {row['error']}")
+    say(f"Written: {out}")
+    return USER_ERROR if failed else 0
+
+
+def fleet_command(
+    sources: Sources,
+    out: Out,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    confirm: Confirm = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Map each SOURCE as a robot's session, merge all; exit 3: some stay apart, 2: one failed."""
+    from neuroslam.runs.fleet import fleet
+    from neuroslam.runs.run import resolve_config
+
+    if confirm is not None:
+        assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
+    with show_runs("fleet") as on_done:
+        report = fleet(
+            sources,
+            out,
+            resolve_config(preset, config, tuple(assignments or ())),
+            preset=preset or "",
+            on_bad_frame=on_bad_frame.value,
+            jobs=jobs,
+            ray=ray,
+            overwrite=overwrite,
+            on_done=on_done,
+        )
+    for row in report.sessions:
+        figures = "failed"
+        if "frames" in row:
+            figures = f"{counted(row['frames'], 'frame')}, {counted(row['experiences'], 'place')}"
+        say(f"session {row['session']}: {row['source']}: {figures}")
+    for row in report.tree:
+        first, second = ("+".join(map(str, row[name])) for name in ("first", "second"))
+        done = "merged" if row["merged"] else "not merged"
+        say(f"level {row['level']}: {first} with {second}: {done}: {row['reason']}")
+    if report.merged:
+        error = report.merged.get("ate_rmse_m")
+        say(
+            f"one map of sessions {', '.join(map(str, report.merged['sessions']))}: "
+            f"{counted(report.merged['experiences'], 'place')}, "
+            f"{counted(report.merged['links'], 'link')}"
+            + ("" if error is None else f"; error against the truth (ATE, rigid) {error:.3f} m")
+        )
+    for part in report.apart:
+        say(f"stays apart: sessions {', '.join(map(str, part['sessions']))}")
+    say(f"Written: {out}")
+    for row in report.failed:
+        complain("fleet", f"session {row['session']}: {row['error']}")
+    return USER_ERROR if report.failed else REFUSED if report.apart else 0
+
+
+def experiment_command(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="One of: " + ", ".join(EXPERIMENTS))],
+    out: Out,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder that holds the recordings, where the experiment needs some."),
+    ] = None,
+    jobs: Jobs = None,
+    ray: RayAddress = None,
+    network: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="view-matching: a network of torchvision too, with the weights of FILE; "
+            "repeatable.",
+        ),
+    ] = None,
+) -> int:
+    """Repeat an experiment of a paper."""
+    from neuroslam.experiments import run_experiment
+
+    networks = dict(_name_and_file(text) for text in network or [])
+    rows = run_experiment(name, data, out, jobs, ray, networks)
+    few = len({key for row in rows for key in row}) <= 9
+    for table in [down(rows, name)] if few else across(rows, name):
+        say(table)
+    say(f"Written: {out}")
+    return 0
+
+
+def _name_and_file(text: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not (name and equals and file):
+        raise ConfigError(f"--network {text!r}: expected NAME=FILE, as resnet18.layer3=weights.pth")
+    return name, Path(file)

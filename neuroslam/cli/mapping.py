@@ -1,0 +1,215 @@
+"""Commands that make maps: run, resume, merge, demo."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from neuroslam.cli.options import (
+    Assignments,
+    BadFrame,
+    ConfigFile,
+    Confirm,
+    NoTensorboard,
+    OnBadFrame,
+    Out,
+    Overwrite,
+    Preset,
+    RunFolder,
+    SaveEvery,
+    Source,
+    Start,
+    Stop,
+)
+from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
+from neuroslam.cli.progress import show_frames
+from neuroslam.errors import counted
+
+if TYPE_CHECKING:
+    from neuroslam.runs.results import RunSummary
+
+
+def run_command(
+    source: Source,
+    out: Out,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    maps: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--map",
+            metavar="OLD",
+            help="Stored map to go on in, a run's folder or a brain file; several are allowed. "
+            "Without --preset or --config its config is taken.",
+        ),
+    ] = None,
+    confirm: Confirm = None,
+    start: Start = 0,
+    stop: Stop = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    no_tensorboard: NoTensorboard = False,
+    save_every: SaveEvery = 60.0,
+    overwrite: Overwrite = False,
+) -> int:
+    """Map a SOURCE; write map, track and brain into a folder."""
+    from neuroslam.brain import read_checkpoint
+    from neuroslam.runs.files import brain_file
+    from neuroslam.runs.run import resolve_config, run
+
+    if confirm is not None:
+        assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
+    base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
+    settings = resolve_config(preset, config, tuple(assignments or ()), base)
+    with show_frames(source) as (on_start, on_step):
+        summary = run(
+            source,
+            out,
+            settings,
+            maps=maps or (),
+            preset=preset or "",
+            start=start,
+            stop=stop,
+            on_bad_frame=on_bad_frame.value,
+            tensorboard=not no_tensorboard,
+            overwrite=overwrite,
+            on_step=on_step,
+            on_start=on_start,
+            save_every_s=save_every,
+        )
+    return _report(summary, out, "run")
+
+
+def resume_command(
+    out: RunFolder,
+    stop: Stop = None,
+    no_tensorboard: NoTensorboard = False,
+    save_every: SaveEvery = 60.0,
+) -> int:
+    """Go on where the run in DIR stopped."""
+    from neuroslam.runs.run import resume
+
+    with show_frames(str(out)) as (on_start, on_step):
+        summary = resume(
+            out,
+            stop=stop,
+            tensorboard=not no_tensorboard,
+            on_step=on_step,
+            on_start=on_start,
+            save_every_s=save_every,
+        )
+    if not summary.added and not summary.failure and not summary.interrupted:
+        say("Nothing was left to do: the run had come to its end already")
+    return _report(summary, out, "resume")
+
+
+def merge_command(
+    first: Annotated[
+        Path, typer.Argument(metavar="A", help="Folder or brain file of the map merged into.")
+    ],
+    second: Annotated[
+        Path, typer.Argument(metavar="B", help="Folder or brain file of the session merged.")
+    ],
+    out: Out,
+    confirm: Confirm = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Merge two finished sessions; exit 0 merged, 3 refused, and then nothing is written."""
+    from neuroslam.runs.merge import merge_runs
+
+    summary, reports = merge_runs(first, second, out, confirm=confirm, overwrite=overwrite)
+    for report in reports:
+        _print_report(report.to_dict())
+    if summary is None:
+        return REFUSED
+    _print_not_joined(summary)
+    say(f"Written: {out}")
+    return 0
+
+
+def demo_command(out: Out = Path("demo")) -> int:
+    """Map an embedded world in two sessions that become one map."""
+    from neuroslam.runs.demo import demo
+
+    with show_frames("world:corridor") as (on_start, on_step):
+        rows = demo(out, on_step, on_start)
+    table = Table(title="A corridor in two sessions, the second from an unknown place")
+    table.add_column("what")
+    table.add_column("figure", justify="right")
+    for name, value in rows:
+        table.add_row(name, value)
+    say(table)
+    say(f"Figures: {out / 'summary.png'}, {out / 'sessions.png'}")
+    say(f"Runs: {out / 'first'}, {out / 'second'}")
+    return 0
+
+
+def _report(summary: "RunSummary", out: Path, command: str) -> int:
+    figures = summary.to_dict()
+    for note in summary.skipped[:3]:
+        complain(command, f"skipped: {note}")
+    if len(summary.skipped) > 3:
+        complain(command, f"skipped: {len(summary.skipped) - 3} more, see metrics.json")
+    say(
+        f"{counted(figures['frames'], 'frame')} at {figures['frames_per_s']:.0f} frames/s: "
+        + ", ".join(
+            counted(figures[f"{what}s".replace(" ", "_")], what)
+            for what in ("template", "experience", "link", "loop closure")
+        )
+    )
+    for note in summary.unused:
+        say(note)
+    if not figures["experiences"]:
+        say(
+            "No places: no picture has the contrast that view.min_contrast asks for"
+            if summary.pictures
+            else "No places: there were no pictures. Without a camera: --preset slrb"
+        )
+    if "place_cells" in figures:
+        lost = figures["lost_s"]
+        say(
+            f"{counted(figures['place_cells'], 'place cell')}, "
+            f"{counted(figures['walls'], 'stretch of wall', 'stretches of wall')}; "
+            + (f"lost for {lost:.0f} s: walls contradicted the map" if lost else "never lost")
+        )
+    for report in summary.merges:
+        _print_report(report)
+    for report in summary.refusals[:3]:
+        _print_report(report)
+    _print_not_joined(summary)
+    if summary.unplaced:
+        say(
+            f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
+            "where the robot only seemed to be carried: --set sessions.carried=ignore"
+        )
+    if summary.accuracy:
+        say(
+            f"error against the truth (ATE, rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
+            f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
+        )
+    say(f"Written: {out}")
+    if summary.failure:
+        complain(command, f"stopped early: {summary.failure}")
+        return USER_ERROR
+    if summary.interrupted:
+        complain(command, f"interrupted; go on with: neuroslam resume {out}")
+        return INTERRUPTED
+    return 0
+
+
+def _print_not_joined(summary: "RunSummary") -> None:
+    for stored in summary.not_joined[:3]:
+        say(f"not joined: the map of {', '.join(stored['sessions'])}; {stored['reason']}")
+    if len(summary.not_joined) > 3:
+        say(f"not joined: {len(summary.not_joined) - 3} more maps, see metrics.json")
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    from neuroslam.merging.merge import MergeReport
+
+    first, *others = MergeReport(**report).lines()
+    at = "" if report["at_frame"] is None else f"frame {report['at_frame']}: "
+    say(f"{at}{first}")
+    for line in others:
+        say(f"  {line}")

@@ -1,0 +1,72 @@
+"""Arguments and options that several commands have."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class OnBadFrame(StrEnum):
+    """What to do with a frame that cannot be used."""
+
+    stop = "stop"
+    skip = "skip"
+
+
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
+MapFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Brain file, or the folder of a run.")
+]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` wrote.")]
+NoTensorboard = Annotated[bool, typer.Option("--no-tensorboard", help="Write no events/.")]
+Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
+Confirm = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Places that must agree before maps are joined; 1: the first view decides."
+    ),
+]
+
+
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="SOURCE",
+        help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
+        "TUM, KITTI or EuRoC folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
+        "world:NAME.",
+    ),
+]
+Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
+Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
+]
+Start = Annotated[int, typer.Option(help="First frame.")]
+BadFrame = Annotated[
+    OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
+]
+SaveEvery = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS", min=0.0, help="Save while driving, for `resume`; 0: only at the end."
+    ),
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(min=1, help="So many at once; 1, or as many as the cluster has processors."),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local to start one"
+    ),
+]

@@ -1,0 +1,64 @@
+"""Commands about the parameters of a brain: tune, presets."""
+
+from itertools import takewhile
+from typing import Annotated
+
+import typer
+
+from neuroslam.cli.options import Assignments, ConfigFile, Out, Preset, Source, Stop
+from neuroslam.cli.output import say
+from neuroslam.cli.progress import show_stages
+from neuroslam.cli.tables import new_table, shown
+
+
+def tune_command(
+    source: Source,
+    out: Out,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    stop: Stop = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier tuning in the folder.")
+    ] = False,
+) -> int:
+    """Find the parameters of a SOURCE's pictures, without truth; write a config for `run`."""
+    from neuroslam.runs.run import resolve_config
+    from neuroslam.tuning import tune
+
+    with show_stages("tune") as on_stage:
+        tuning = tune(
+            source,
+            out,
+            resolve_config(preset, config, tuple(assignments or ())),
+            stop=stop,
+            overwrite=overwrite,
+            on_stage=on_stage,
+        )
+    table = new_table("parameter", "before", "found", "because")
+    for key, (before, found, why) in tuning.changes.items():
+        table.add_row(key, *("none" if v is None else shown(v) for v in (before, found)), why)
+    say(table)
+    for note in tuning.notes:
+        say(note)
+    for name, trial in (("before", tuning.before), ("found", tuning.after)):
+        say(
+            f"{name}: {trial.n_places} places, {trial.n_links} links, "
+            f"inconsistency {shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
+        )
+    say(tuning.verdict)
+    say(f"Written: {out}; now: neuroslam run {source} --config {out}/config.toml -o map")
+    return 0
+
+
+def presets_command() -> int:
+    """List the presets and what they are for."""
+    from neuroslam.config import preset_folder, preset_names
+
+    table = new_table("preset", "for")
+    for name in preset_names():
+        lines = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()
+        about = takewhile(lambda line: line.startswith("#"), lines)
+        table.add_row(name, " ".join(line.lstrip("# ") for line in about))
+    say(table)
+    return 0

@@ -1,0 +1,40 @@
+"""Tables of what was found."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from rich.table import Column, Table
+
+
+def new_table(*names: str, title: str | None = None, headed: bool = True) -> Table:
+    """Make a table whose words are never cut: a name that is told is one to be copied."""
+    columns = (Column(name, overflow="fold") for name in names)
+    return Table(*columns, title=title, show_header=headed)
+
+
+def down(rows: list[dict[str, Any]], title: str) -> Table:
+    """Make a table of a line a row."""
+    table = new_table(*(key.replace("_", " ") for key in rows[0]), title=title)
+    for row in rows:
+        table.add_row(*map(shown, row.values()))
+    return table
+
+
+def across(rows: list[dict[str, Any]], title: str) -> Iterator[Table]:
+    """Make tables of a column a row, three columns each: for many figures of few maps."""
+    for first in range(0, len(rows), 3):
+        some = rows[first : first + 3]
+        table = Table(title=title, show_header=False)
+        for key in dict.fromkeys(key for row in some for key in row):
+            cells = [shown(row.get(key, "")) for row in some]
+            if any(cells):
+                table.add_row(key.replace("_", " "), *cells)
+        yield table
+
+
+def shown(value: object) -> str:
+    """Write a value as a table has it: numbers with four digits, nothing for NaN."""
+    if isinstance(value, float):
+        return f"{value:.4g}" if value == value else ""  # NaN is not equal to itself
+    text = "; ".join(map(shown, value)) if isinstance(value, list) else str(value)
+    return text.replace("_", " ")

@@ -1,0 +1,116 @@
+"""OpenRatSLAM's config files: its names for our parameters, and reading them."""
+
+import configparser
+import math
+from pathlib import Path
+from typing import Any
+
+from neuroslam.config.brain import BrainConfig
+from neuroslam.errors import ConfigError, did_you_mean
+
+# OpenRatSLAM's name -> (section, our name), for the parameters that carry over one to one.
+CLASSIC_NAMES: dict[str, tuple[str, str]] = {
+    "template_x_size": ("view", "template_width"),
+    "template_y_size": ("view", "template_height"),
+    "vt_shift_match": ("view", "shift_match"),
+    "vt_step_match": ("view", "shift_step"),
+    "vt_normalisation": ("view", "normalisation"),
+    "vt_patch_normalise": ("view", "patch_radius"),
+    "vt_min_patch_normalisation_std": ("view", "patch_min_std"),
+    "vt_panoramic": ("view", "panoramic"),
+    "vt_match_threshold": ("view", "threshold"),
+    "vt_active_decay": ("pose_cells", "active_decay"),
+    "pc_dim_xy": ("pose_cells", "n_xy"),
+    "pc_dim_th": ("pose_cells", "n_theta"),
+    "pc_w_e_dim": ("pose_cells", "excite_size"),
+    "pc_w_i_dim": ("pose_cells", "inhibit_size"),
+    "pc_w_e_var": ("pose_cells", "excite_std_xy"),
+    "pc_w_i_var": ("pose_cells", "inhibit_std_xy"),
+    "pc_global_inhib": ("pose_cells", "global_inhibition"),
+    "pc_vt_inject_energy": ("pose_cells", "inject_energy"),
+    "pc_vt_restore": ("pose_cells", "restore"),
+    "pc_cell_x_size": ("pose_cells", "cell_size_m"),
+    "exp_delta_pc_threshold": ("pose_cells", "create_threshold_cells"),
+    "exp_correction": ("map", "correction"),
+    "exp_loops": ("map", "loops"),
+    "exp_initial_em_deg": ("map", "initial_heading_deg"),
+    "camera_fov_deg": ("odometry", "fov_deg"),
+    "vtrans_scaling": ("odometry", "speed_scaling_m_s"),
+    "vtrans_max": ("odometry", "max_speed_m_s"),
+}
+
+_CLASSIC_REGIONS = {
+    "image_crop": ("view", "crop"),
+    "vtrans_image": ("odometry", "speed_region"),
+    "vrot_image": ("odometry", "turn_region"),
+}
+
+# What else a classic file holds that has no meaning without ROS: where topics and media are.
+_CLASSIC_IGNORED = {"topic_root", "media_path", "image_file", "enable", "odom_map", "calibrate"}
+
+
+def from_classic(text: str, path: Path) -> dict[str, Any]:
+    """Read the text of an OpenRatSLAM ``.ini``/``.txt`` as nested keys and values, by our names.
+
+    Args:
+        text: Content of the file.
+        path: Its name, for what is said of mistakes in it.
+
+    Raises:
+        ConfigError: If it cannot be parsed, a key is unknown, or a value is no number.
+    """
+    parser = configparser.ConfigParser(
+        interpolation=None, inline_comment_prefixes=("#", ";"), strict=False
+    )
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        raise ConfigError(
+            f"config {path}: not an OpenRatSLAM file: {str(error).splitlines()[0]}"
+        ) from None
+    values: dict[str, Any] = {}
+    regions: dict[str, dict[str, int]] = {}
+    for section in parser.sections():
+        for key, raw in parser[section].items():
+            prefix = key.removesuffix("_x_min").removesuffix("_x_max")
+            prefix = prefix.removesuffix("_y_min").removesuffix("_y_max")
+            if section in ("draw", "general") or key in _CLASSIC_IGNORED:
+                continue
+            try:
+                number = float(raw)
+            except ValueError:
+                raise ConfigError(
+                    f"config {path}: {key} = {raw!r} in [{section}]; expected a number"
+                ) from None
+            if prefix in _CLASSIC_REGIONS:
+                regions.setdefault(prefix, {})[key.removeprefix(prefix + "_")] = int(number)
+            elif key == "camera_hz":
+                values["frame_rate_hz"] = number
+            elif key in CLASSIC_NAMES:
+                where, name = CLASSIC_NAMES[key]
+                values.setdefault(where, {})[name] = _as_field(where, name, number)
+            else:
+                raise ConfigError(
+                    f"config {path}: unknown key {key!r} in [{section}]"
+                    f"{did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
+                )
+    for prefix, edges in regions.items():
+        where, name = _CLASSIC_REGIONS[prefix]
+        missing = [e for e in ("x_min", "x_max", "y_min", "y_max") if e not in edges]
+        if missing:
+            raise ConfigError(f"config {path}: {prefix}_{missing[0]} is missing")
+        values.setdefault(where, {})[name] = tuple(
+            edges[e] for e in ("x_min", "x_max", "y_min", "y_max")
+        )
+    cells = values.get("pose_cells", {})
+    for kernel in ("excite", "inhibit"):  # the classic file has one width for place and direction
+        if f"{kernel}_std_xy" in cells:
+            cells[f"{kernel}_std_theta"] = cells[f"{kernel}_std_xy"]
+    if not math.isfinite(values.get("frame_rate_hz", 1.0)):
+        raise ConfigError(f"config {path}: camera_hz is not a finite number")
+    return values
+
+
+def _as_field(section: str, name: str, number: float) -> float | int | bool:
+    annotation = type(getattr(getattr(BrainConfig(), section), name))
+    return annotation(number) if number == int(number) else number

@@ -1,0 +1,163 @@
+"""Presets, config files and assignments: nested values, from which a config is built; and TOML."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from neuroslam.config.brain import BrainConfig
+from neuroslam.config.classic import from_classic
+from neuroslam.errors import ConfigError, did_you_mean
+
+
+def preset_folder() -> Path:
+    """Return the folder of the presets: inside an installed package, or at a checkout's top."""
+    inside = Path(__file__).parents[1] / "configs"
+    return inside if inside.is_dir() else Path(__file__).parents[2] / "configs"
+
+
+def preset_names() -> list[str]:
+    """Return the names that ``--preset`` accepts."""
+    return sorted(path.stem for path in preset_folder().glob("*.toml"))
+
+
+def read_preset(name: str) -> dict[str, Any]:
+    """Read a preset of :func:`preset_names` as nested keys and values.
+
+    Raises:
+        ConfigError: If there is no such preset.
+    """
+    if name not in preset_names():
+        raise ConfigError(
+            f"unknown preset {name!r}; there are {', '.join(preset_names())}"
+            f"{did_you_mean(name, preset_names())}"
+        )
+    return read_config_file(preset_folder() / f"{name}.toml")
+
+
+def read_config_file(path: Path) -> dict[str, Any]:
+    """Read our TOML, or an OpenRatSLAM ``.ini``/``.txt``, as nested keys and values.
+
+    Raises:
+        ConfigError: If the file is missing or cannot be parsed.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"config {path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"config {path}: cannot be read as text ({error})") from None
+    if path.suffix.lower() in (".ini", ".txt"):
+        return from_classic(text, path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"config {path}: not valid TOML: {error}") from None
+
+
+def merge_values(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Lay nested values over others; ``over`` wins key by key.
+
+    Example:
+        >>> merge_values({"view": {"threshold": 0.1}}, {"view": {"panoramic": True}})
+        {'view': {'threshold': 0.1, 'panoramic': True}}
+    """
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge_values(merged[key], value) if both else value
+    return merged
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """Turn ``section.key=value`` into nested values; the value is read as TOML, else as text.
+
+    Raises:
+        ConfigError: If there is no ``=``.
+
+    Example:
+        >>> parse_assignment("view.threshold=0.04")
+        {'view': {'threshold': 0.04}}
+    """
+    key, equals, raw = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set {text!r}: expected section.key=value, e.g. view.threshold=0.04")
+    try:
+        value = tomllib.loads(f"value = {raw.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = raw.strip()
+    for part in reversed(key.strip().split(".")):
+        value = {part: value}
+    return value
+
+
+def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
+    """Check nested values and make the config of a brain from them.
+
+    Raises:
+        ConfigError: One line that names the key, what was got and what was expected.
+    """
+    try:
+        return BrainConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(part for part in first["loc"] if isinstance(part, str))
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(f"{origin}: unknown key {where!r}{_key_meant(where)}") from None
+        said = first["msg"].removeprefix("Value error, ")
+        said = said[0].lower() + said[1:]
+        if first["type"] == "model_type":
+            said = f"is a section; set one of its keys, as {where}.KEY"
+        elif where.endswith(("crop", "region")):
+            said = "expected four whole numbers x_min, x_max, y_min, y_max"
+        raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
+
+
+def _all_keys(section: type[BaseModel] = BrainConfig, path: str = "") -> list[str]:
+    keys = []
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            keys += [f"{path}{name}", *_all_keys(inner, f"{path}{name}.")]
+        else:
+            keys.append(f"{path}{name}")
+    return keys
+
+
+def _key_meant(word: str) -> str:
+    known, last = _all_keys(), word.rpartition(".")[2]
+    without_section = [key for key in known if key.rpartition(".")[2] == last]
+    return did_you_mean(word, known) or "".join(
+        f"; did you mean {key!r}?" for key in without_section[:1]
+    )
+
+
+def to_toml(config: BrainConfig) -> str:
+    """Write the complete config, as in force, as TOML; reading it back gives the same config.
+
+    Example:
+        >>> build_config(tomllib.loads(to_toml(BrainConfig()))) == BrainConfig()
+        True
+    """
+    return "\n".join(_toml_table(config.model_dump(), "")) + "\n"
+
+
+def _toml_table(values: dict[str, Any], path: str) -> list[str]:
+    plain = {k: v for k, v in values.items() if not isinstance(v, dict) and v is not None}
+    lines = [f"{name} = {_toml(value)}" for name, value in plain.items()]
+    for name, value in values.items():
+        if isinstance(value, dict):
+            lines += ["", f"[{path}{name}]", *_toml_table(value, f"{path}{name}.")]
+    return lines
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(value)

@@ -1,0 +1,73 @@
+"""A run's errors against the truth."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+from neuroslam.errors import RunError, counted
+from neuroslam.evaluation.trajectory import (
+    AlignmentMode,
+    ErrorStatistics,
+    absolute_trajectory_error,
+    associate,
+    read_tum,
+    relative_pose_error,
+)
+from neuroslam.runs.reading import read_trace, track_file, true_poses
+
+
+def evaluate(
+    track: str | Path,
+    truth: str | Path | None = None,
+    align: AlignmentMode = "rigid",
+    on_note: Callable[[str], None] | None = None,
+) -> list[tuple[str, ErrorStatistics, str]]:
+    """Compare a run, or any TUM file, with the true track.
+
+    Args:
+        track: Folder of a run, or a TUM file.
+        truth: TUM file; a run of a source that knows its truth needs none.
+        align: How the track is laid over the truth before it is compared.
+        on_note: Called with what the errors leave out, if they do: frames without a true pose.
+
+    Returns:
+        Name of the error, its statistics, its unit.
+
+    Raises:
+        NeuroslamError: If a file is missing or damaged, or there is no truth to compare with.
+    """
+    track = Path(track)
+    if align not in get_args(AlignmentMode):
+        raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
+    out = track if track.is_dir() else None
+    found = read_tum(track if out is None else track_file(out))
+    if truth is not None:
+        true = read_tum(Path(truth))
+        i, j = associate(found.times_s, true.times_s)
+        estimate, reference = found.poses[i], true.poses[j]
+    else:
+        trace = None if out is None else read_trace(out, len(found.times_s))
+        true_track = None if trace is None else true_poses(trace)
+        if true_track is None:
+            raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
+        i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
+        estimate, reference = found.poses[i], true_track[j]
+    if len(estimate) < 2:
+        raise RunError(
+            f"{track}: {len(estimate)} of its frames have a true pose of their time; expected two"
+        )
+    n_frames = len(found.times_s)
+    if on_note is not None and len(estimate) < n_frames:
+        on_note(
+            f"{len(estimate)} of {counted(n_frames, 'frame')} have truth; the errors are theirs"
+        )
+    relative = relative_pose_error(estimate, reference)
+    return [
+        (
+            "absolute (ATE)",
+            absolute_trajectory_error(estimate[:, :2], reference[:, :2], align),
+            "m",
+        ),
+        ("relative, a frame", relative.translation_m, "m"),
+        ("relative, a frame", relative.rotation_rad, "rad"),
+    ]

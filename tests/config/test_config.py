@@ -1,0 +1,155 @@
+"""Configs: bounds, unknown keys, files, presets, OpenRatSLAM's own files."""
+
+import importlib.util
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from neuroslam.config import (
+    CLASSIC_NAMES,
+    BrainConfig,
+    build_config,
+    merge_values,
+    parse_assignment,
+    preset_names,
+    read_config_file,
+    read_preset,
+    to_toml,
+)
+from neuroslam.errors import ConfigError
+from neuroslam.runs.run import resolve_config
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_a_config_and_survives_toml(name):
+    config = build_config(read_preset(name))
+    assert build_config(tomllib.loads(to_toml(config))) == config
+
+
+def test_the_presets_the_data_need_are_there():
+    wanted = {"openratslam", "irat", "new_college", "lab_tour", "virtual_tour", "rc_car"}
+    assert wanted <= set(preset_names())
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"view": {"treshold": 0.1}},
+            r"unknown key 'view.treshold'; did you mean 'view.threshold'",
+        ),
+        ({"threshold": 0.1}, r"unknown key 'threshold'; did you mean 'view.threshold'"),
+        ({"view": {"threshold": 2}}, r"view.threshold = 2: input should be less than 1"),
+        ({"view": {"shift_match": 30}}, r"shift_match 30 leaves no column of template_width 60"),
+        ({"pose_cells": {"n_xy": 3}}, r"pose_cells.n_xy = 3: input should be greater than"),
+        ({"map": {"correction": 0.7}}, r"map.correction = 0.7"),
+        ({"map": {"correction": float("nan")}}, r"map.correction"),
+        ({"odometry": {"fov_deg": float("inf")}}, r"odometry.fov_deg"),
+        ({"view": 3}, r"view = 3: is a section; set one of its keys, as view\.KEY"),
+        ({"view": {"crop": [0, 1, 2]}}, r"view\.crop = .*expected four whole numbers x_min"),
+        ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
+        ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_line(values, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        build_config(values)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_config_cannot_be_changed_after_it_was_checked():
+    with pytest.raises(ValueError, match="frozen"):
+        BrainConfig().view.threshold = 3
+
+
+def test_the_later_wins():
+    over = merge_values(read_preset("rc_car"), parse_assignment("view.threshold=0.01"))
+    config = build_config(over)
+    assert config.view.threshold == 0.01
+    assert (
+        config.pose_cells.cell_size_m == build_config(read_preset("rc_car")).pose_cells.cell_size_m
+    )
+
+
+def test_assignments_read_toml_values():
+    assert parse_assignment("view.crop=[0, 160, 0, 60]") == {"view": {"crop": [0, 160, 0, 60]}}
+    assert parse_assignment("map.solver=least_squares") == {"map": {"solver": "least_squares"}}
+    with pytest.raises(ConfigError, match=r"expected section\.key=value"):
+        parse_assignment("nonsense")
+
+
+def test_openratslam_files_are_read(shared):
+    path = shared / "refs" / "ratslam" / "config_usi_track1.ini"
+    config = resolve_config("openratslam", path)
+    assert config.view.crop == (0, 160, 0, 60)
+    assert config.view.threshold == 0.035
+    assert config.odometry.turn_region == (20, 140, 10, 60)
+    assert config.pose_cells.inhibit_std_theta == 2.0
+    assert config.view.panoramic is False
+    assert config.map.loops == 20
+
+
+def test_a_classic_file_may_have_comments_and_topics(tmp_path):
+    path = tmp_path / "irat.txt"
+    path.write_text(
+        "[general]\ntopic_root=irat_red\n[ratslam]\nvt_match_threshold=0.04 # a comment\n"
+        "pc_dim_th=36\n[draw]\nenable=1\n"
+    )
+    assert read_config_file(path) == {"view": {"threshold": 0.04}, "pose_cells": {"n_theta": 36}}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.ini", "[ratslam]\nvt_match_treshold=1\n", "unknown key 'vt_match_treshold'.*did you"),
+        ("a.ini", "[ratslam]\nvt_match_threshold=x\n", "expected a number"),
+        ("a.ini", "no section\n", "not an OpenRatSLAM file"),
+        ("a.ini", "[ratslam]\nimage_crop_x_min=1\n", "image_crop_x_max is missing"),
+        ("a.toml", "view = [", "not valid TOML"),
+        ("a.toml", b"\xff\xfe\x00", "cannot be read as text"),
+    ],
+)
+def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_config_file(path)
+    assert name in str(caught.value)
+
+
+def test_missing_files_and_presets_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        read_config_file(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match=r"unknown preset 'rc_cart'.*did you mean 'rc_car'"):
+        read_preset("rc_cart")
+
+
+def test_every_classic_name_leads_to_a_field_of_ours():
+    config = BrainConfig()
+    for section, name in CLASSIC_NAMES.values():
+        assert hasattr(getattr(config, section), name)
+
+
+def test_the_page_of_parameters_is_up_to_date():
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    spec = importlib.util.spec_from_file_location("parameters", docs / "parameters.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert (docs / "parameters.md").read_text() == module.page(), "run: python docs/parameters.py"
+
+
+def described(section, path=""):
+    for key, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            assert inner.__doc__, f"{path}{key}"
+            yield from described(inner, f"{path}{key}.")
+        else:
+            assert field.description, f"{path}{key}"
+            yield f"{path}{key}"
+
+
+def test_every_parameter_says_what_it_does():
+    assert "semantic.space.reach_m" in set(described(BrainConfig))
