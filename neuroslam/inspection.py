@@ -26,6 +26,7 @@ from neuroslam.mapping.tables import Links, closes_loop
 from neuroslam.population import State
 from neuroslam.run_files import (
     LANDMARKS_FILE,
+    TEXT_COLUMNS,
     brain_file,
     experiences_csv,
     frame_rows,
@@ -436,21 +437,36 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
 
 
 def _table_fault(path: Path, expected: str) -> str:
+    columns, *should = expected.splitlines()
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
-        rows = [[float(value) for value in line.split(",")] for line in lines]
+        if header != columns:
+            return f"its columns are {header!r}, expected {columns!r}"
+        rows = [_values(line, columns) for line in lines]
     except (OSError, ValueError) as error:
         return f"cannot be read ({_why(error)})"
-    names, *should = expected.splitlines()
-    if header != names:
-        return f"its columns are {header!r}, expected {names!r}"
     if len(rows) != len(should):
         return f"{counted(len(rows), 'row')}, the brain has {len(should)}"
     differ = [
         i for i, (row, line) in enumerate(zip(rows, should, strict=True))
-        if row != [float(value) for value in line.split(",")]
+        if row != _values(line, columns)
     ]  # fmt: skip
     return f"rows {_some(differ)} differ from the brain" if differ else ""
+
+
+def _values(line: str, columns: str) -> list[str | float]:
+    """Parse a row of a CSV table: text in the columns that hold text, numbers in all others.
+
+    Raises:
+        ValueError: If the row has too few or too many values, or one is not a number.
+    """
+    names, cells = columns.split(","), line.split(",")
+    if len(cells) != len(names):
+        raise ValueError(f"a row has {counted(len(cells), 'value')}, expected {len(names)}")
+    return [
+        cell if name in TEXT_COLUMNS else float(cell)
+        for name, cell in zip(names, cells, strict=True)
+    ]
 
 
 def _why(error: Exception) -> str:

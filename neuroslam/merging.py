@@ -164,6 +164,8 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
             for file in ("brain.safetensors", *RUN_FILES, LANDMARKS_FILE):
                 if (beside / file).exists():
                     (beside / file).replace(out / file)
+                else:  # of an earlier run: it would not fit the new map
+                    (out / file).unlink(missing_ok=True)
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary

@@ -40,6 +40,9 @@ RUN_FILES = (
 LANDMARKS_FILE = "landmarks.csv"
 """Besides, where the brain has a semantic map."""
 
+TEXT_COLUMNS = ("name",)
+"""Columns of experiences.csv, links.csv and landmarks.csv that hold text; all others: numbers."""
+
 _FIGURES = ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges")
 
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
@@ -134,9 +137,10 @@ def require_free(out: Path, source: str, overwrite: bool) -> None:
     """
     if out.exists() and not out.is_dir():
         raise RunError(f"{out}: is a file; expected a folder to write")
-    if Path(source) in (out.resolve(), *(out.resolve() / name for name in RUN_FILES)):
+    written = (*RUN_FILES, LANDMARKS_FILE)
+    if Path(source) in (out.resolve(), *(out.resolve() / name for name in written)):
         raise RunError(f"{out}: is where the source is, which would change; take another folder")
-    if not overwrite and any((out / name).exists() for name in RUN_FILES):
+    if not overwrite and any((out / name).exists() for name in written):
         raise RunError(f"{out}: holds a run already; resume it, take another folder or --overwrite")
 
 
@@ -218,7 +222,7 @@ class RowWriter:
 
 def _remove_halves(out: Path) -> None:
     """Remove what a run that was killed while it wrote a file has left of it."""
-    for name in RUN_FILES:
+    for name in (*RUN_FILES, LANDMARKS_FILE):
         for half in out.glob(f".{name}.*.tmp"):
             half.unlink(missing_ok=True)
 
