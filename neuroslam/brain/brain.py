@@ -15,7 +15,7 @@ from neuroslam.brain.matching import shared_history
 from neuroslam.brain.merge import Match, differing, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.brain.sessions import Session, SessionLog, session_id
-from neuroslam.cells.boundary import check_walls
+from neuroslam.cells.boundary import checked_walls
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
@@ -25,6 +25,12 @@ from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.population import Population, Running, State
+from neuroslam.sensors.frames import (
+    check_instant,
+    check_picture,
+    checked_number,
+    checked_odometry,
+)
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.spiking.semantic import SemanticCells
@@ -214,11 +220,12 @@ class NavigationBrain(nn.Module):
         walls = view = None
         landmarks = []
         compass = config.cells != ("pose",) and frame.heading_rad is not None
-        if compass and not math.isfinite(frame.heading_rad):
-            raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
+        if compass:
+            checked_number(frame.heading_rad, "heading", "rad")
+        if image is not None:
+            check_picture(image)
         if config.has("place") and frame.walls is not None:
-            check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
-            walls = frame.walls
+            walls = checked_walls(frame.walls)
         elif config.has("place") and frame.ranges is not None:
             walls = walls_in_scan(frame.ranges, config.boundary_cells.reach_m)
         if config.has("semantic"):
@@ -510,6 +517,7 @@ class NavigationBrain(nn.Module):
         return compose(Pose(*self.map.experiences["pose"][experience].tolist()), offset)
 
     def _elapsed(self, frame: Frame) -> float:
+        check_instant(frame)
         if not self.clock.frames_seen:
             return 1.0 / self.config.frame_rate_hz
         dt_s = frame.time_s - self.clock.time_s
@@ -534,10 +542,7 @@ class NavigationBrain(nn.Module):
     def _velocity(self, frame: Frame, dt_s: float) -> Velocity:
         use = self.config.odometry.use
         if use != "visual" and frame.velocity is not None:
-            if not all(map(math.isfinite, frame.velocity)):
-                v, w = frame.velocity
-                raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
-            return Velocity(*map(float, frame.velocity))
+            return checked_odometry(frame.velocity)
         if use == "given" or frame.image is None:
             raise BadFrame(
                 "no odometry in the source"

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.cells.boundary import BoundaryCells, check_walls
+from neuroslam.cells.boundary import BoundaryCells, check_walls, checked_walls
 from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.joining import join_navigation
@@ -18,6 +18,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
 from neuroslam.population import Join, Population, State, without_gradients
+from neuroslam.sensors.frames import checked_number
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, Pose, ViewMatch
 
@@ -183,16 +184,16 @@ class NavigationCells(Population):
             BadFrame: If a number cannot be; nothing has changed then.
         """
         now, compass = self.now, compass_rad is not None
+        if compass:
+            compass_rad = checked_number(compass_rad, "heading", "rad")
         heading = (
             wrap_angle(compass_rad + now.turned_rad)
             if compass
             else wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
         )
         felt = torch.empty((0, 2), dtype=torch.float64)
-        if walls is not None and len(walls):
-            felt = torch.from_numpy(np.array(walls, dtype=np.float64))
-            if felt.dim() != 2 or felt.shape[1] != 2:
-                raise BadFrame(f"walls have shape {tuple(felt.shape)}; expected (n, 2)")
+        if walls is not None:
+            felt = torch.from_numpy(checked_walls(walls).copy())
             felt = felt[felt[:, 0].argsort()]
         device = self.walls.errors.device
         numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)

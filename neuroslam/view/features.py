@@ -21,7 +21,8 @@ from neuroslam import vision
 from neuroslam.checked_files import first_line, tensors_digest
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.view.preprocess import Encoded, check_picture, crop, encode
+from neuroslam.sensors.frames import check_picture
+from neuroslam.view.preprocess import Encoded, crop, encode
 
 Encoder = Callable[[np.ndarray], Encoded]
 """Makes the template of a picture."""
@@ -109,7 +110,7 @@ class FeatureEncoder:
             BadFrame: If the picture is of another type or shape, or its features not finite.
             ConfigError: If the crop leaves the picture, or the network gives no features.
         """
-        check_picture(image)
+        check_picture(image, "LocalViewCells")
         config = self.config
         image = crop(image, config.crop)
         rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
