@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from neuroslam.errors import ConfigError, did_you_mean
 from neuroslam.sections import (
@@ -153,7 +153,9 @@ def read_config_file(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"config {path}: no such file") from None
+        preset = path.name.removesuffix(".toml")
+        hint = f"; {preset} is a preset, --preset {preset}" if preset in preset_names() else ""
+        raise ConfigError(f"config {path}: no such file{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"config {path}: cannot be read as text ({error})") from None
     if path.suffix.lower() in (".ini", ".txt"):
@@ -198,7 +200,7 @@ def _from_classic(text: str, path: Path) -> dict[str, Any]:
             else:
                 raise ConfigError(
                     f"config {path}: unknown key {key!r} in [{section}]"
-                    f"{did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
+                    f"{did_you_mean(key, _classic_keys())}"
                 )
     for prefix, edges in regions.items():
         where, name = _CLASSIC_REGIONS[prefix]
@@ -215,6 +217,12 @@ def _from_classic(text: str, path: Path) -> dict[str, Any]:
     if not math.isfinite(values.get("frame_rate_hz", 1.0)):
         raise ConfigError(f"config {path}: camera_hz is not a finite number")
     return values
+
+
+def _classic_keys() -> list[str]:
+    edges = ("x_min", "x_max", "y_min", "y_max")
+    regions = [f"{region}_{edge}" for region in _CLASSIC_REGIONS for edge in edges]
+    return [*CLASSIC_NAMES, "camera_hz", *regions, *sorted(_CLASSIC_IGNORED)]
 
 
 def _as_field(section: str, name: str, number: float) -> float | int | bool:
@@ -269,8 +277,8 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(part for part in first["loc"] if isinstance(part, str))
-        if first["type"] == "extra_forbidden":
-            raise ConfigError(f"{origin}: unknown key {where!r}{_key_meant(where)}") from None
+        if first["type"] == "unknown_key":
+            raise ConfigError(f"{origin}: {first['msg']}") from None
         said = first["msg"].removeprefix("Value error, ")
         said = said[0].lower() + said[1:]
         if first["type"] == "model_type":
@@ -278,25 +286,6 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         elif where.endswith(("crop", "region")):
             said = "expected four whole numbers x_min, x_max, y_min, y_max"
         raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
-
-
-def _all_keys(section: type[BaseModel] = BrainConfig, path: str = "") -> list[str]:
-    keys = []
-    for name, field in section.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            keys += [f"{path}{name}", *_all_keys(inner, f"{path}{name}.")]
-        else:
-            keys.append(f"{path}{name}")
-    return keys
-
-
-def _key_meant(word: str) -> str:
-    known, last = _all_keys(), word.rpartition(".")[2]
-    without_section = [key for key in known if key.rpartition(".")[2] == last]
-    return did_you_mean(word, known) or "".join(
-        f"; did you mean {key!r}?" for key in without_section[:1]
-    )
 
 
 def to_toml(config: BrainConfig) -> str:

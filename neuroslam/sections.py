@@ -1,16 +1,109 @@
 """Sections of a brain's config: every parameter with its unit, its bounds and what it does."""
 
-from typing import Literal, Self
+import re
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from neuroslam.errors import did_you_mean, nearest
 
 Region = tuple[int, int, int, int]
 
 
 class Section(BaseModel):
-    """A group of parameters: frozen, unknown keys refused, no infinities."""
+    """A group of parameters: frozen, unknown keys refused, no infinities.
+
+    An unknown key or choice is told together with the known one that is most like it.
+
+    Example:
+        >>> PoseCellConfig(n_xz=20)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        pydantic_core._pydantic_core.ValidationError: 1 validation error for PoseCellConfig
+        n_xz
+          unknown key 'n_xz'; did you mean 'n_xy'? [type=unknown_key, ...]
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _say_what_was_meant(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(values)
+        except ValidationError as error:
+            told = error.errors(include_url=False)
+            if not {each["type"] for each in told} & {"extra_forbidden", *_WITH_HINTS}:
+                raise
+        # Unknown keys first: what else is wrong may follow from them.
+        told.sort(key=lambda each: each["type"] not in ("extra_forbidden", "unknown_key"))
+        lines = [_with_hint(cls, each) for each in told]
+        raise ValidationError.from_exception_data(cls.__name__, lines)
+
+
+_WITH_HINTS = ("unknown_key", "literal_error")
+
+
+def _with_hint(section: type[BaseModel], told: Mapping[str, Any]) -> InitErrorDetails:
+    """Complete an error of pydantic by what was meant, where it is of an unknown key or choice."""
+    kind, said, context = told["type"], told["msg"], told.get("ctx", {})
+    if kind in ("extra_forbidden", "unknown_key"):  # the latter of an inner section
+        key = ".".join(str(part) for part in told["loc"])
+        kind, said = "unknown_key", f"unknown key {key!r}{_key_meant(section, key)}"
+    elif kind == "literal_error" and "did you mean" not in said:
+        said += _choice_meant(told)
+    # The text as a value: it may hold braces, which a template may not.
+    error = PydanticCustomError(kind, "{said}", {**context, "said": said})
+    return InitErrorDetails(type=error, loc=told["loc"], input=told["input"])
+
+
+def _choice_meant(told: Mapping[str, Any]) -> str:
+    """End an error about an unknown choice with the one that is most like it, if any is."""
+    return did_you_mean(str(told["input"]), re.findall(r"'([^']*)'", told["ctx"]["expected"]))
+
+
+def all_keys(section: type[BaseModel], path: str = "") -> list[str]:
+    """Return the dotted keys of a section and of all sections within it.
+
+    Example:
+        >>> all_keys(SessionConfig)[:2]
+        ['confirm', 'drift']
+    """
+    keys = []
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        keys.append(f"{path}{name}")
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            keys += all_keys(inner, f"{path}{name}.")
+    return keys
+
+
+def _key_meant(section: type[BaseModel], key: str) -> str:
+    """Guess a key: one of that name in another section, else one like it in the same, or anywhere.
+
+    Args:
+        section: Within which all keys are.
+        key: Dotted, from that section on.
+    """
+    known = all_keys(section)
+    place, _, last = key.rpartition(".")
+    same = [each for each in known if each.rpartition(".")[2] == last]
+    if same:
+        return f"; did you mean {' or '.join(map(repr, same[:3]))}?"
+    beside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == place}
+    anywhere = {each.rpartition(".")[2]: each for each in reversed(known)}
+    for names in (beside, anywhere):
+        if (name := nearest(last, names)) is not None:
+            return f"; did you mean {names[name]!r}?"
+    return did_you_mean(key, known)
 
 
 class OdometryConfig(Section):
@@ -74,7 +167,7 @@ class ViewConfig(Section):
         if named and self.weights is None:
             raise ValueError(
                 f"features {self.features} needs weights: a file that holds the network's "
-                "state_dict"
+                f"state_dict{did_you_mean(self.features, ('grey', 'module'))}"
             )
         if self.weights is not None and not named:
             raise ValueError(f"weights are of a named network, and features is {self.features}")

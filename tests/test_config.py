@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from neuroslam.config import (
     CLASSIC_NAMES,
@@ -20,6 +20,7 @@ from neuroslam.config import (
 )
 from neuroslam.errors import ConfigError
 from neuroslam.runs import resolve_config
+from neuroslam.sections import PoseCellConfig
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -51,12 +52,75 @@ def test_the_presets_the_data_need_are_there():
         ({"view": {"crop": [0, 1, 2]}}, r"view\.crop = .*expected four whole numbers x_min"),
         ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
         ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
+        ({"map": {"solver": "relx"}}, r"map.solver = 'relx': .*; did you mean 'relax'\?$"),
+        ({"cells": "pose+plase"}, r"cells = 'plase': .*; did you mean 'place'\?$"),
+        ({"veiw": {}}, r"config: unknown key 'veiw'; did you mean 'view'\?$"),
+        ({"view": {"n_xy": 9}}, r"unknown key 'view\.n_xy'; did you mean 'pose_cells\.n_xy'\?$"),
+        (
+            {"view": {"threshold": 2}, "semantic": {"space": {"reach": 3.0}}},
+            r"key 'semantic\.space\.reach'; did you mean 'semantic\.space\.reach_m'\?$",
+        ),
+        (
+            {"sigma_m": 0.1},
+            r"'sigma_m'; did you mean 'map\.sigma_m' or 'boundary_cells\.sigma_m' or "
+            r"'wall_memory\.sigma_m'\?$",
+        ),
+        ({"view": {"{0}": 1}}, r"unknown key 'view\.\{0\}'"),
+        ({"view": {"features": "gray"}}, r"features gray needs weights: .*; did you mean 'grey'\?"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line(values, message):
     with pytest.raises(ConfigError, match=message) as caught:
         build_config(values)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "where", "said"),
+    [
+        (
+            lambda: BrainConfig(veiw={}),
+            ("veiw",),
+            "unknown key 'veiw'; did you mean 'view'?",
+        ),
+        (
+            lambda: BrainConfig(view={"treshold": 0.1}),
+            ("view", "treshold"),
+            "unknown key 'view.treshold'; did you mean 'view.threshold'?",
+        ),
+        (
+            lambda: PoseCellConfig(n_xz=3),
+            ("n_xz",),
+            "unknown key 'n_xz'; did you mean 'n_xy'?",
+        ),
+        (
+            lambda: BrainConfig(semantic={"space": {"reach": 3.0}}),
+            ("semantic", "space", "reach"),
+            "unknown key 'semantic.space.reach'; did you mean 'semantic.space.reach_m'?",
+        ),
+        (
+            lambda: BrainConfig(semantic={"tier": "spikin"}),
+            ("semantic", "tier"),
+            "Input should be 'algebraic', 'rate' or 'spiking'; did you mean 'spiking'?",
+        ),
+        (lambda: PoseCellConfig(mood="fine"), ("mood",), "unknown key 'mood'"),
+    ],
+)
+def test_a_config_made_in_python_says_what_was_meant(make, where, said):
+    with pytest.raises(ValidationError) as caught:
+        make()
+    [error] = caught.value.errors()
+    assert (error["loc"], error["msg"]) == (where, said)
+
+
+def test_what_else_is_wrong_is_told_after_unknown_keys():
+    with pytest.raises(ValidationError) as caught:
+        BrainConfig(view={"threshold": 2}, map={"solver": "relx"}, threads=0, cels="pose")
+    errors = caught.value.errors()
+    assert [error["type"] for error in errors] == [
+        "unknown_key", "less_than", "literal_error", "greater_than_equal",
+    ]  # fmt: skip
+    assert caught.value.title == "BrainConfig"
 
 
 def test_a_config_cannot_be_changed_after_it_was_checked():
@@ -104,6 +168,11 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
     ("name", "text", "message"),
     [
         ("a.ini", "[ratslam]\nvt_match_treshold=1\n", "unknown key 'vt_match_treshold'.*did you"),
+        (
+            "a.ini",
+            "[ratslam]\nvrot_image_xmin=1\n",
+            "key 'vrot_image_xmin' in .*did you mean 'vrot_image_x_min'",
+        ),
         ("a.ini", "[ratslam]\nvt_match_threshold=x\n", "expected a number"),
         ("a.ini", "no section\n", "not an OpenRatSLAM file"),
         ("a.ini", "[ratslam]\nimage_crop_x_min=1\n", "image_crop_x_max is missing"),
@@ -122,6 +191,8 @@ def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
 def test_missing_files_and_presets_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         read_config_file(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match=r"no such file; rc_car is a preset, --preset rc_car$"):
+        read_config_file(Path("rc_car"))
     with pytest.raises(ConfigError, match=r"unknown preset 'rc_cart'.*did you mean 'rc_car'"):
         read_preset("rc_cart")
 
