@@ -1,7 +1,7 @@
 """Sections of a brain's config: every parameter with its unit, its bounds and what it does."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Self
 
 from pydantic import (
@@ -17,6 +17,9 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from neuroslam.errors import did_you_mean, nearest
 
 Region = tuple[int, int, int, int]
+
+_SPACING_RATIO = 1.3  # of a grid module to the next smaller one
+_GOLDEN = 0.6180339887498949
 
 
 class Section(BaseModel):
@@ -145,7 +148,12 @@ class ViewConfig(Section):
     threshold: float = Field(
         0.05, gt=0, lt=1, description="largest mean difference that is a match; larger: fewer views"
     )
-    shift_match: int = Field(4, ge=0, description="columns a forward view may be shifted by")
+    shift_match: int = Field(
+        4,
+        ge=0,
+        description="columns a forward view may be shifted by; of a template narrower than 9 px, "
+        "if it is not set, the most that leaves a column",
+    )
     shift_step: int = Field(1, ge=1, description="columns between two shifts that are tried")
     panoramic: bool = Field(False, description="roll through the full turn, report the heading")
     normalisation: float = Field(0.5, ge=0, le=1, description="mean grey to scale to; 0: off")
@@ -160,6 +168,16 @@ class ViewConfig(Section):
     precision: Literal["uint8", "float64"] = Field(
         "uint8", description="how a template is kept: one byte a pixel, or eight"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shift_follows_the_width(cls, values: object) -> object:
+        if not isinstance(values, Mapping) or {"shift_match", "panoramic"} & values.keys():
+            return values
+        width, usual = values.get("template_width"), cls.model_fields["shift_match"].default
+        if not isinstance(width, int) or width > 2 * usual or width < 2:
+            return values
+        return {**values, "shift_match": (width - 1) // 2}
 
     @model_validator(mode="after")
     def _weights_are_of_a_named_network(self) -> Self:
@@ -304,10 +322,13 @@ class GridCellConfig(Section):
         (0.35, 0.46, 0.60, 0.78),
         min_length=1,
         description="distance of neighbouring fields, one for each module; ratios near 1.3 "
-        "keep places apart",
+        "keep places apart. If only orientations_deg is set: the first of these, further ones 1.3 "
+        "times the one before",
     )
     orientations_deg: tuple[float, ...] = Field(
-        (0.0, 15.0, -10.0, 7.0), description="of the grid axes, one for each module"
+        (0.0, 15.0, -10.0, 7.0),
+        description="of the grid axes, one for each module. If only spacings_m is set: the first "
+        "of these, and 37.08 k degrees of a further module k (the first is 0), within +-30",
     )
     directions: int = Field(
         6, ge=3, description="preferred directions of a module; other than 6: no hexagons"
@@ -324,16 +345,58 @@ class GridCellConfig(Section):
     learns_online: bool = Field(False, description="go on learning while moving")
     seed: int = Field(0, ge=0, description="of the random weights before development")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_list_follows_the_other(cls, values: object) -> object:
+        pair = ("spacings_m", "orientations_deg")
+        if not isinstance(values, Mapping) or len(values.keys() & set(pair)) != 1:
+            return values
+        given, other = sorted(pair, key=lambda name: name not in values)
+        if not isinstance(values[given], Sequence) or isinstance(values[given], str | bytes):
+            return values  # no list: what is wrong with it is told where it is checked
+        start = cls.model_fields[other].default
+        extend = _more_spacings if other == "spacings_m" else _more_orientations
+        n = max(1, len(values[given]))
+        return {**values, other: extend(start, n)[:n]}
+
     @model_validator(mode="after")
     def _modules_agree(self) -> Self:
         if len(self.spacings_m) != len(self.orientations_deg):
             raise ValueError(
                 f"spacings_m has {len(self.spacings_m)} modules, orientations_deg "
-                f"{len(self.orientations_deg)}; expected the same"
+                f"{len(self.orientations_deg)}; expected the same, or only one of the two"
             )
         if min(self.spacings_m) <= 0:
             raise ValueError(f"spacings_m has {min(self.spacings_m)}; expected more than 0")
         return self
+
+
+def _more_spacings(spacings_m: tuple[float, ...], n: int) -> tuple[float, ...]:
+    """Extend spacings by the ratio of modules, to the centimetre.
+
+    Example:
+        >>> _more_spacings((0.6, 0.78), 4)
+        (0.6, 0.78, 1.01, 1.31)
+    """
+    while len(spacings_m) < n:
+        spacings_m = (*spacings_m, round(_SPACING_RATIO * spacings_m[-1], 2))
+    return spacings_m
+
+
+def _more_orientations(orientations_deg: tuple[float, ...], n: int) -> tuple[float, ...]:
+    """Extend orientations so that no two of few are alike, in [-30, 30) degrees.
+
+    Hexagonal axes are the same again after 60 degrees; multiples of the golden section fill that
+    range evenly, however many they are.
+
+    Example:
+        >>> _more_orientations((0.0, 15.0, -10.0, 7.0), 6)
+        (0.0, 15.0, -10.0, 7.0, 28.3, 5.4)
+    """
+    further = range(len(orientations_deg), n)
+    return orientations_deg + tuple(
+        round((60.0 * _GOLDEN * k + 30.0) % 60.0 - 30.0, 1) for k in further
+    )
 
 
 class PlaceCellConfig(Section):

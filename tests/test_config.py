@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from neuroslam.cells import NavigationCells
 from neuroslam.config import (
     CLASSIC_NAMES,
     BrainConfig,
@@ -20,7 +21,8 @@ from neuroslam.config import (
 )
 from neuroslam.errors import ConfigError
 from neuroslam.runs import resolve_config
-from neuroslam.sections import PoseCellConfig
+from neuroslam.sections import GridCellConfig, PoseCellConfig, ViewConfig
+from neuroslam.semantic_sections import SSPSpaceConfig
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -142,6 +144,84 @@ def test_assignments_read_toml_values():
     assert parse_assignment("map.solver=least_squares") == {"map": {"solver": "least_squares"}}
     with pytest.raises(ConfigError, match=r"expected section\.key=value"):
         parse_assignment("nonsense")
+
+
+# --- parameters that must agree -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spacings_m", "orientations_deg"),
+    [
+        ((0.25,), (0.0,)),
+        ((0.5, 0.7), (0.0, 15.0)),
+        ((0.35, 0.46, 0.6, 0.78), (0.0, 15.0, -10.0, 7.0)),
+        # 60 / 1.618 = 37.08 degrees, times 4, 5 and 6, wrapped to [-30, 30)
+        ((0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), (0.0, 15.0, -10.0, 7.0, 28.3, 5.4, -17.5)),
+    ],
+)
+def test_orientations_follow_the_number_of_spacings(spacings_m, orientations_deg):
+    config = BrainConfig(grid_cells={"spacings_m": spacings_m})
+    assert config.grid_cells.orientations_deg == orientations_deg
+    assert build_config(tomllib.loads(to_toml(config))) == config
+    assert build_config({"grid_cells": {"spacings_m": list(spacings_m)}}) == config
+
+
+@pytest.mark.parametrize(
+    ("orientations_deg", "spacings_m"),
+    [
+        ((5.0,), (0.35,)),
+        ((5.0, 6.0, 7.0), (0.35, 0.46, 0.6)),
+        ((1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (0.35, 0.46, 0.6, 0.78, 1.01, 1.31)),
+    ],
+)
+def test_spacings_follow_the_number_of_orientations(orientations_deg, spacings_m):
+    config = GridCellConfig(orientations_deg=orientations_deg)
+    assert config.spacings_m == spacings_m
+    assert config.orientations_deg == orientations_deg
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"spacings_m": [0.3], "orientations_deg": [0.0, 15.0]},
+            "spacings_m has 1 modules, orientations_deg 2; expected the same, or only one of the",
+        ),
+        ({"orientations_deg": []}, "spacings_m has 1 modules, orientations_deg 0"),
+        ({"spacings_m": []}, r"spacings_m = \[\]: tuple should have at least 1 item"),
+        ({"spacings_m": 0.3}, r"spacings_m = 0\.3: input should be a valid tuple"),
+        ({"spacings_m": "0.3"}, r"spacings_m = '0\.3': input should be a valid tuple"),
+        ({"spacings_m": [-0.3]}, r"spacings_m has -0\.3; expected more than 0"),
+    ],
+)
+def test_grid_modules_that_do_not_agree_are_one_line(values, message):
+    with pytest.raises(ConfigError, match=message):
+        build_config({"grid_cells": values})
+
+
+def test_cells_live_with_one_spacing_given():
+    cells = NavigationCells(BrainConfig(grid_cells={"spacings_m": (0.25,), "n_cells": 4}))
+    assert cells.grid.rates.shape == (1, 4)
+
+
+@pytest.mark.parametrize(("width", "shift"), [(2, 0), (5, 2), (8, 3), (9, 4), (60, 4)])
+def test_the_shift_follows_a_narrow_template(width, shift):
+    assert ViewConfig(template_width=width).shift_match == shift
+    with pytest.raises(ValidationError, match="leaves no column"):
+        ViewConfig(template_width=width, shift_match=(width + 1) // 2)
+
+
+def test_the_dimension_follows_scales_that_are_given_for_each():
+    assert SSPSpaceConfig(reach_m=(1.0, 2.0, 3.0)).dimension == 3
+    assert SSPSpaceConfig(length_scale_m=(0.2, 0.3, 0.4), reach_m=(1.0, 2.0, 3.0)).dimension == 3
+    assert SSPSpaceConfig(reach_m=2.0).dimension == 2
+    with pytest.raises(ValidationError, match="one number or 2 of them"):
+        SSPSpaceConfig(dimension=2, reach_m=(1.0, 2.0, 3.0))
+    with pytest.raises(ConfigError, match=r"space.dimension is 3; a brain lives in 2"):
+        build_config({"semantic": {"space": {"reach_m": [1.0, 2.0, 3.0]}}})
+
+
+# --- files --------------------------------------------------------------------------------------
 
 
 def test_openratslam_files_are_read(shared):
