@@ -12,6 +12,7 @@ from torch import nn
 
 import neuroslam
 from neuroslam.cells import GridSheet
+from neuroslam.storage import Scalars
 
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
@@ -97,6 +98,12 @@ def test_no_module_hides_a_name_of_torch(module):
     of_torch = {name for name in {*dir(nn.Module), *vars(nn.Module())} if not name.startswith("_")}
     hidden = names_of(module) & of_torch - MEANT_TO_BE_OVERRIDDEN
     assert not hidden
+
+
+@pytest.mark.parametrize("name", ["parameters", "half", "training"])
+def test_a_number_of_the_state_hides_no_name_of_torch(name):
+    with pytest.raises(ValueError, match=f"'{name}' is a name of nn.Module"):
+        Scalars(**{name: 1})
 
 
 def test_the_parameters_of_every_module_can_be_listed():
