@@ -13,10 +13,12 @@ import torch
 from neuroslam.cell_panels import CellPanels
 from neuroslam.errors import RunError
 from neuroslam.plotting import plot_map, render
+from neuroslam.semantic_panels import SemanticPanels, known_landmarks
 from neuroslam.types import Frame, StepResult
 
 if TYPE_CHECKING:
     from neuroslam.brain.brain import NavigationBrain
+    from neuroslam.spiking.semantic import SemanticCells
 
 _WIDTH = 320  # pixels of a recorded picture: a 60x10 template is too small to see
 _THUMBNAIL = 48  # pixels of a template's side in the projector, whose sprite must stay small
@@ -63,6 +65,11 @@ class TensorBoardRecorder(Recorder):
     images ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, ever
     rarer as they cost ever more.
 
+    A brain with a semantic map has besides: landmarks, how long they contradict, and of the last
+    step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate`` and ``ssp/lost``; rates of its
+    populations, where they are neurons; and as rarely as those the images ``ssp/map``, what the
+    map recalls for the landmarks seen most often, and ``ssp/spikes``.
+
     Args:
         folder: Where the event files go; made if missing.
         scalars_every: Frames between two points of a curve.
@@ -93,6 +100,7 @@ class TensorBoardRecorder(Recorder):
         self._clock = (time.perf_counter(), 0)
         self._seen = 0
         self._cells: CellPanels | None = None
+        self._semantic: tuple[SemanticCells, SemanticPanels] | None = None
         self._cells_due = 0  # frame
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
@@ -106,6 +114,8 @@ class TensorBoardRecorder(Recorder):
         if brain.config.has("place"):
             self._cells = self._cells or CellPanels()
             self._cells.note(brain)
+        if brain.config.has("semantic"):
+            self._watch(brain.semantic)
         if result.frame % self.scalars_every == 0:
             self._write_scalars(result, brain)
         if result.frame % self.images_every == 0:
@@ -129,7 +139,20 @@ class TensorBoardRecorder(Recorder):
                 self._write_map(frame, brain, last=True)
             if brain.view.n:
                 self._write_projector(frame, brain)
+        if self._semantic is not None:
+            self._semantic[0].watch = None
+            self._semantic = None
         self._writer.close()
+
+    def _watch(self, cells: "SemanticCells") -> None:
+        """Be told of the steps of SSP-SLAM; a brain that joins or starts a map has new cells."""
+        if self._semantic is not None:
+            if self._semantic[0] is cells:
+                return
+            self._semantic[0].watch = None
+        panels = SemanticPanels(cells.slam, self._writer)
+        self._semantic = cells, panels
+        cells.watch = panels.note
 
     def _write_scalars(self, result: StepResult, brain: "NavigationBrain") -> None:
         now, (then, seen) = time.perf_counter(), self._clock
@@ -150,6 +173,8 @@ class TensorBoardRecorder(Recorder):
         if brain.config.has("semantic"):
             values["semantic/landmarks"] = brain.semantic.n
             values["semantic/contradicted_s"] = float(brain.semantic.slam.contradicted_s[0])
+        if self._semantic is not None:
+            self._semantic[1].write_scalars(result.frame)
         for tag, value in values.items():
             self._writer.add_scalar(tag, value, result.frame)
 
@@ -162,14 +187,21 @@ class TensorBoardRecorder(Recorder):
             landmarks=brain.landmarks_m,
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
-        if self._cells is not None and (last or frame >= self._cells_due):
+        if last or frame >= self._cells_due:
             self._cells_due = frame + max(self.maps_every, frame // 2)
+            self._write_cells(frame, brain)
+        self._drawn = frame
+
+    def _write_cells(self, frame: int, brain: "NavigationBrain") -> None:
+        if self._cells is not None:
             figures, scores = self._cells.draw(brain)
             for tag, drawn in figures.items():
                 self._write_picture(tag, render(drawn), frame)
             for tag, score in scores.items():
                 self._writer.add_scalar(tag, score, frame)
-        self._drawn = frame
+        if self._semantic is not None:
+            cells, panels = self._semantic
+            panels.write_pictures(frame, known_landmarks(cells))
 
     def _write_picture(self, tag: str, picture: np.ndarray, frame: int) -> None:
         self._writer.add_image(tag, picture, frame, dataformats="HWC")

@@ -1,6 +1,7 @@
 """The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from neuroslam.sensors.landmarks import LandmarkView
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED, NAMELESS, VIEW, Guide, Sightings, Told
-from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.slam import SSPSLAM, SSPStep
 from neuroslam.storage import GrowingTable, Scalars
 from neuroslam.types import Motion, Pose
 
@@ -86,6 +87,7 @@ class SemanticCells(Population):
             told=-1,  # landmark that has told where the robot is, in this turn of attention
         )
         self.slam.start(torch.zeros(1, 2))
+        self.watch: Callable[[int, SSPStep], None] | None = None  # a recorder's, of each step
         self._rows: dict[tuple[int, int], int] = {}
         self.register_load_state_dict_pre_hook(_take_pointers)
         self.register_load_state_dict_post_hook(lambda module, _: module._index())
@@ -93,10 +95,10 @@ class SemanticCells(Population):
     @property
     def n(self) -> int:
         """Number of landmarks that count: seen more than a time or two."""
-        return int(self._counts().sum())
+        return int(self.counts().sum())
 
-    def _counts(self) -> Tensor:
-        """Tell which landmarks were seen so often that they are none by mistake."""
+    def counts(self) -> Tensor:
+        """Tell of each row of ``known`` whether it was seen so often that it is no mistake."""
         return (self.known["seen"] >= LEAST_SEEN) | (self.known["kind"] == VIEW)
 
     @property
@@ -107,7 +109,7 @@ class SemanticCells(Population):
 
     def landmarks(self) -> dict[str, np.ndarray]:
         """Return the columns of the landmarks that count, and their names."""
-        rows = self._counts()
+        rows = self.counts()
         columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
         both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
         return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
@@ -333,7 +335,7 @@ class SemanticCells(Population):
         low = np.tile(low, (steps, 1, 1, 1))
         view = LandmarkView(in_view, distance, low, low, np.arange(n))
         velocity = torch.tensor(step_m) / (steps * dt)
-        said = slam.run(velocity.expand(steps, 1, 2), view)
+        said = slam.run(velocity.expand(steps, 1, 2), view, self.watch)
         recall, gate, lost, attended = (
             part[-1, 0].item() for part in (said.recall, said.gate, said.lost, said.attended)
         )
