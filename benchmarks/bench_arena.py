@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.timing import Row, cpu_ms
-from neuroslam.sensors.arena import Arena, named_arena
 from neuroslam.sensors.scan import walls_in_scan
+from neuroslam.worlds.arena import Arena, named_arena
 
 N, REACH_M, BEAMS = 100_000, 0.3, 180
 

@@ -9,7 +9,7 @@ from benchmarks.bench_ssp import Animals, milliseconds
 from benchmarks.timing import Row
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.config import PoseCellConfig
-from neuroslam.semantic_sections import SSPSLAMConfig
+from neuroslam.config.semantic import SSPSLAMConfig
 from neuroslam.types import Motion
 
 BRAINS = 64

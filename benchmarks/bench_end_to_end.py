@@ -12,7 +12,7 @@ from benchmarks.bench_view_search import memory, places
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.runs import resolve_config, run
+from neuroslam.runs.run import resolve_config, run
 from neuroslam.types import Frame, Motion, Velocity
 
 SPACING_M = 0.1

@@ -21,8 +21,8 @@ import torch
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.parallel import one_thread
-from neuroslam.runs import resolve_config, run
+from neuroslam.runs.parallel import one_thread
+from neuroslam.runs.run import resolve_config, run
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, StepResult, Velocity
 

@@ -7,9 +7,9 @@ import torch
 from benchmarks.bench_relaxation import laps
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.brain import NavigationBrain
-from neuroslam.brain.merge import Match, merge
+from neuroslam.merging.merge import Match, merge
 from neuroslam.brain.recognition import StoredViews
-from neuroslam.brain.sessions import Session
+from neuroslam.state.sessions import Session
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.overlap import Pairs
 from neuroslam.view.search import block_means

@@ -7,9 +7,9 @@ import torch
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.config import BrainConfig
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.sensors.senses import SenseNoise, sense
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
+from neuroslam.worlds.senses import SenseNoise, sense
 
 STEPS_30_MIN = 36_000
 BATCH = 32

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from benchmarks.timing import Row
-from neuroslam.experiments.ssp_lives import slam_in, views
-from neuroslam.semantic_sections import (
+from neuroslam.config.semantic import (
     NeuronConfig,
     PathIntegratorConfig,
     SemanticMapConfig,
     SSPSLAMConfig,
 )
-from neuroslam.sensors.landmark_paths import band_limited_path
-from neuroslam.sensors.landmarks import random_world
+from neuroslam.experiments.ssp_lives import slam_in, views
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.worlds.landmark_paths import band_limited_path
+from neuroslam.worlds.landmarks import random_world
 
 BATCH = 8
 REFERENCE = SSPSLAMConfig(

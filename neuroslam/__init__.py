@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuroslam.brain import NavigationBrain, load_brain, save_brain
     from neuroslam.config import BrainConfig
-    from neuroslam.runs import run
+    from neuroslam.runs.run import run
     from neuroslam.sensors import open_source
 
 __version__ = "0.1.0"
@@ -17,7 +17,7 @@ _HOME = {
     "save_brain": "neuroslam.brain",
     "BrainConfig": "neuroslam.config",
     "open_source": "neuroslam.sensors",
-    "run": "neuroslam.runs",
+    "run": "neuroslam.runs.run",
 }
 
 __all__ = ["BrainConfig", "NavigationBrain", "load_brain", "open_source", "run", "save_brain"]

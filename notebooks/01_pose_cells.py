@@ -30,9 +30,9 @@ import torch
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.cells.attractor import inject
 from neuroslam.config import PoseCellConfig
-from neuroslam.drawing import ACTIVITY, INK, LOOP, MAP, STYLE, legend_below, write_title
 from neuroslam.errors import MapError
-from neuroslam.plotting import plot_pose_cells
+from neuroslam.figures.maps import plot_pose_cells
+from neuroslam.figures.style import ACTIVITY, INK, LOOP, MAP, STYLE, legend_below, write_title
 from neuroslam.types import Motion, PoseEstimate, ViewMatch
 
 torch.set_num_threads(1)

@@ -26,16 +26,25 @@ import numpy as np
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
-from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, ROBOT, STYLE, legend_below, write_title
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.geometry import integrate_velocities
-from neuroslam.plotting import (
+from neuroslam.figures.maps import (
     contact_sheet,
     plot_frame_and_template,
     plot_map,
     plot_pose_cells,
     plot_signals,
 )
+from neuroslam.figures.style import (
+    INK,
+    LOOP,
+    MAP,
+    ODOMETRY,
+    ROBOT,
+    STYLE,
+    legend_below,
+    write_title,
+)
+from neuroslam.geometry import integrate_velocities
 from neuroslam.types import Pose
 
 torch.set_num_threads(1)

@@ -26,15 +26,15 @@ import numpy as np
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import MergeReport
-from neuroslam.drawing import STYLE, legend_below, write_title
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import MergeReport
 from neuroslam.evaluation.icp import fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.lives import Picture, bindings, live, measure, stage, track
-from neuroslam.merge_drawing import SESSIONS, plot_bindings, plot_overlay, plot_stages
-from neuroslam.merging import join_brains
-from neuroslam.plotting import contact_sheet, plot_frame_and_template, plot_map
+from neuroslam.figures.maps import contact_sheet, plot_frame_and_template, plot_map
+from neuroslam.figures.sessions import SESSIONS, plot_bindings, plot_overlay, plot_stages
+from neuroslam.figures.style import STYLE, legend_below, write_title
+from neuroslam.runs.merge import join_brains
 
 torch.set_num_threads(1)
 plt.rcParams.update(STYLE | {"figure.constrained_layout.use": True, "figure.dpi": 100})

@@ -23,18 +23,18 @@ import numpy as np
 import torch
 
 from neuroslam import NavigationBrain, open_source
-from neuroslam.cell_drawing import Firing, draw_arena, plot_firing_maps, plot_grids
 from neuroslam.cells import LAHNGridCells, NavigationCells, VelocityOscillators
 from neuroslam.cells.boundary import boundary_activity, boundary_zone
 from neuroslam.config import BrainConfig, GridCellConfig, build_config, read_preset
-from neuroslam.drawing import INK, LOOP, MAP, ODOMETRY, ROBOT, STYLE
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
 from neuroslam.experiments.animals import live, path_integration, position_errors
-from neuroslam.merging import join_brains
-from neuroslam.plotting import plot_map
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
+from neuroslam.figures.cells import Firing, draw_arena, plot_firing_maps, plot_grids
+from neuroslam.figures.maps import plot_map
+from neuroslam.figures.style import INK, LOOP, MAP, ODOMETRY, ROBOT, STYLE
+from neuroslam.runs.merge import join_brains
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
 
 torch.set_num_threads(1)
 plt.rcParams.update(STYLE)

@@ -23,16 +23,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from neuroslam.drawing import INK, MAP, STYLE
+from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig, SSPSLAMConfig
 from neuroslam.experiments.ssp_lives import integrate, live, pointers_of, slam_in, views
 from neuroslam.experiments.ssp_map import similarity_map
-from neuroslam.semantic_drawing import Query, plot_area, plot_queries
-from neuroslam.semantic_sections import PathIntegratorConfig, SemanticMapConfig, SSPSLAMConfig
-from neuroslam.sensors.landmark_paths import band_limited_path
-from neuroslam.sensors.landmarks import paper_world, random_world
-from neuroslam.spike_drawing import plot_errors, plot_rasters, plot_signals, plot_trials
+from neuroslam.figures.landmarks import Query, plot_area, plot_queries
+from neuroslam.figures.spikes import plot_errors, plot_rasters, plot_signals, plot_trials
+from neuroslam.figures.style import INK, MAP, STYLE
 from neuroslam.spiking import PositionDecoder, SSPSpace, bind, queries, unbind
 from neuroslam.spiking.joining import merge_semantic_maps
+from neuroslam.worlds.landmark_paths import band_limited_path
+from neuroslam.worlds.landmarks import paper_world, random_world
 
 torch.set_num_threads(1)
 plt.rcParams.update(STYLE)

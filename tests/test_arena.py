@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.errors import SourceError
-from neuroslam.sensors.arena import Arena, named_arena
+from neuroslam.worlds.arena import Arena, named_arena
 
 NAMES = [
     "triangle", "square", "pentagon", "nonagon", "circle1m", "circle2m",

@@ -12,7 +12,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, shape_rmse
 from neuroslam.geometry import integrate_velocities
-from neuroslam.runs import resolve_config
+from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Pose, Velocity
 

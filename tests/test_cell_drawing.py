@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from neuroslam import cell_drawing as cd
-from neuroslam.drawing import new_figure
 from neuroslam.evaluation.ratemap import Bins
-from neuroslam.plotting import render
-from neuroslam.sensors.arena import Arena, named_arena
+from neuroslam.figures import cells as cd
+from neuroslam.figures.maps import render
+from neuroslam.figures.style import new_figure
+from neuroslam.worlds.arena import Arena, named_arena
 
 ARENA = named_arena("square")
 BINS = Bins.around([[-1, -1], [1, 1]], 0.05)

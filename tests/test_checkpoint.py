@@ -13,10 +13,10 @@ from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
-from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.sensors import open_source
+from neuroslam.state.files import tensors_digest
 from neuroslam.types import Frame
 
 WORLD = "world:corridor?laps=2&noise=0.05"
@@ -147,7 +147,7 @@ def test_a_failed_save_leaves_the_old_brain(brain, saved, monkeypatch):
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("neuroslam.checked_files.save_file", full)
+    monkeypatch.setattr("neuroslam.state.files.save_file", full)
     with pytest.raises(OSError, match="No space left"):
         save_brain(brain, saved)
     assert saved.read_bytes() == before

@@ -19,8 +19,8 @@ from safetensors.torch import load_file, save_file
 from neuroslam import cli
 from neuroslam.cli import main
 from neuroslam.config import preset_names
-from neuroslam.inspection import inspect
-from neuroslam.run_files import read_frames
+from neuroslam.runs.files import read_frames
+from neuroslam.runs.inspect import inspect
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60"
 QUICK = "--no-tensorboard"

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam import cli, vision
+from neuroslam import cli
 from neuroslam.sensors import open_source
 from neuroslam.types import ViewMatch
+from neuroslam.view import vision
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

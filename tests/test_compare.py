@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from neuroslam.comparison_drawing import plot_losses
 from neuroslam.experiments.compare import (
     LANDMARKS,
     LOSSES,
@@ -15,7 +14,8 @@ from neuroslam.experiments.compare import (
     live,
     pixel_landmarks,
 )
-from neuroslam.plotting import render
+from neuroslam.figures.comparison import plot_losses
+from neuroslam.figures.maps import render
 from neuroslam.sensors import open_source
 
 

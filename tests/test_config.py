@@ -19,10 +19,10 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
+from neuroslam.config.sections import GridCellConfig, PoseCellConfig, ViewConfig
+from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import ConfigError
-from neuroslam.runs import resolve_config
-from neuroslam.sections import GridCellConfig, PoseCellConfig, ViewConfig
-from neuroslam.semantic_sections import SSPSpaceConfig
+from neuroslam.runs.run import resolve_config
 
 
 @pytest.mark.parametrize("name", preset_names())

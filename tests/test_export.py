@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.sessions import session_name
+from neuroslam.state.sessions import session_name
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError, ConfigError, RunError, SourceError
 from neuroslam.evaluation.trajectory import read_tum
-from neuroslam.export import export
 from neuroslam.geometry import compose, wrap_angles
-from neuroslam.runs import run
+from neuroslam.runs.export import export
+from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
 from neuroslam.types import Pose
 

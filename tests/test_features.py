@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import nn
 
-from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain, vision
-from neuroslam.brain.matching import find_match
+from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
+from neuroslam.merging.match import find_match
 from neuroslam.config import ViewConfig
+from neuroslam.config.sections import SessionConfig
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.experiments import run_experiment
-from neuroslam.sections import SessionConfig
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
-from neuroslam.view import LocalViewCells
+from neuroslam.view import LocalViewCells, vision
 from neuroslam.view.features import FeatureEncoder, features_as_template, load_network
 
 SMALL = {"features": "module", "template_width": 16, "template_height": 32, "shift_match": 3}

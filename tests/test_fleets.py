@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from neuroslam import load_brain
-from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
-from neuroslam.fleets import FleetReport, Part, _names, _pairs, fleet
-from neuroslam.run_files import RUN_FILES, TIMINGS
+from neuroslam.runs.files import RUN_FILES, TIMINGS
+from neuroslam.runs.fleet import FleetReport, Part, _names, _pairs, fleet
+from neuroslam.state.files import tensors_digest
 
 LOOK = "width=128&height=32"
 RING = f"world:ellipse?laps=0.4&noise=0.01&{LOOK}"

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import Match, make_join, merge
 from neuroslam.config import build_config, merge_values, read_preset
+from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import BadFrame, MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
-from neuroslam.semantic_sections import SemanticConfig
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import Match, make_join, merge
 from neuroslam.sensors import open_source
 from neuroslam.spiking.landmark_frames import shared_frames
 from neuroslam.spiking.semantic import SemanticCells

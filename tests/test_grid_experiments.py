@@ -12,9 +12,9 @@ from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import rate_map
 from neuroslam.experiments import boundary_cells, grid_cells, grid_comparison
 from neuroslam.experiments.census import Gatherer, arena_bins, by_seed, live_grid, median
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.sensors.senses import NO_NOISE, SenseNoise, sense
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
+from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
 
 FEW = GridCellConfig(
     spacings_m=(0.3, 0.5), orientations_deg=(0.0, 15.0), n_cells=4, development_steps=500

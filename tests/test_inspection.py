@@ -12,13 +12,13 @@ from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
-from neuroslam.checked_files import tensors_digest
 from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import CheckpointError
-from neuroslam.inspection import inspect, verify
-from neuroslam.run_files import FRAME_COLUMNS, RunPlan, experiences_csv, links_csv
-from neuroslam.runs import RunSummary, run
+from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, experiences_csv, links_csv
+from neuroslam.runs.inspect import inspect, verify
+from neuroslam.runs.run import RunSummary, run
 from neuroslam.sensors import open_source
+from neuroslam.state.files import tensors_digest
 
 ELLIPSE = "world:ellipse?laps=2&width=256&height=64"
 CORRIDOR = "world:corridor?width=64&height=40&frames_per_lap=60&laps=1"

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from neuroslam.errors import SourceError
-from neuroslam.sensors.landmark_paths import (
+from neuroslam.worlds.landmark_paths import (
     LandmarkPath,
     band_limited_path,
     path_of_walk,
     read_kitti,
     read_path,
 )
-from neuroslam.sensors.landmarks import (
+from neuroslam.worlds.landmarks import (
     make_world,
     paper_world,
     point,
@@ -21,7 +21,7 @@ from neuroslam.sensors.landmarks import (
     read_world,
     wall,
 )
-from neuroslam.sensors.rodent import read_walk
+from neuroslam.worlds.rodent import read_walk
 
 
 def test_a_wall_is_as_far_as_its_nearest_point():

@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from torch import nn
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import Match, differing_keys, make_join, merge, merge_states
-from neuroslam.brain.sessions import Session
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import Match, differing_keys, make_join, merge, merge_states
+from neuroslam.state.sessions import Session
 from neuroslam.cells.convolve import Packet
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
-from neuroslam.inspection import verify
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
-from neuroslam.population import Population
+from neuroslam.runs.inspect import verify
 from neuroslam.sensors import open_source
+from neuroslam.state.population import Population
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
 few = settings(max_examples=15, deadline=None)

@@ -7,8 +7,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from mpl_toolkits.mplot3d.art3d import Line3D, Line3DCollection
 
-from neuroslam import drawing, plotting
-from neuroslam import merge_drawing as md
+from neuroslam.figures import maps as plotting
+from neuroslam.figures import sessions as md
+from neuroslam.figures import style as drawing
 
 TORUS = (21, 21, 36)
 

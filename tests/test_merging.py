@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam import load_brain, review, run
-from neuroslam.brain.merge import MergeReport
+from neuroslam import load_brain, run
 from neuroslam.cli import main
-from neuroslam.run_files import RUN_FILES, RunPlan, read_frames
+from neuroslam.merging.merge import MergeReport
+from neuroslam.runs import review
+from neuroslam.runs.files import RUN_FILES, RunPlan, read_frames
 
 WORLD = "world:ellipse?laps=2&width=128&height=32"
 OTHER = "world:corridor?laps=1&width=128&height=32"
@@ -352,7 +353,7 @@ def full(*_args, **_options):
 
 
 @pytest.mark.parametrize(
-    "where", ["neuroslam.checked_files.save_file", "os.fsync", "shutil.copyfile"]
+    "where", ["neuroslam.state.files.save_file", "os.fsync", "shutil.copyfile"]
 )
 def test_on_a_full_disk_the_folder_stays_as_it_was(
     where, runs, merged, tmp_path, monkeypatch, mistake
@@ -373,7 +374,7 @@ import os, signal, sys, time
 import torch
 torch.set_num_threads(1)
 from neuroslam.brain import load_brain
-from neuroslam.merging import merge_runs
+from neuroslam.runs.merge import merge_runs
 
 a, b, out = sys.argv[1:]
 merge_runs(a, b, out)

@@ -11,10 +11,10 @@ from neuroslam.cells.familiarity import Familiarity, felt_walls
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.config import BoundaryCellConfig, BrainConfig
 from neuroslam.errors import BadFrame
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.sensors.senses import SenseNoise, sense
 from neuroslam.types import Motion, Pose, ViewMatch
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
+from neuroslam.worlds.senses import SenseNoise, sense
 
 CONFIG = BrainConfig()
 RATE_HZ = 10.0

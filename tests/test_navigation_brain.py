@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.wall_matching import Outline, lay_walls
+from neuroslam.cells.wall_matching import Outline, lay_walls
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.errors import BadFrame
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
 from neuroslam.geometry import wrap_angles
-from neuroslam.inspection import inspect, verify
-from neuroslam.merging import join_brains, merge_runs
-from neuroslam.runs import resume, run
+from neuroslam.runs.inspect import inspect, verify
+from neuroslam.runs.merge import join_brains, merge_runs
+from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
 

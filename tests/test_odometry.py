@@ -12,8 +12,8 @@ from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.odometry import VisualOdometry
 from neuroslam.odometry.visual import match_profiles, profile
 from neuroslam.sensors import open_source
-from neuroslam.sensors.world import open_world
 from neuroslam.types import Velocity
+from neuroslam.worlds.world import open_world
 
 DT = 0.05
 STILL = Velocity(0.0, 0.0)

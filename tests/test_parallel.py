@@ -13,8 +13,8 @@ import torch
 
 from neuroslam.config import read_preset
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
-from neuroslam.parallel import outcomes, parallel_map
-from neuroslam.sweeps import parse_values
+from neuroslam.runs.parallel import outcomes, parallel_map
+from neuroslam.runs.sweep import parse_values
 
 
 def test_results_come_in_the_order_of_the_items():
@@ -82,7 +82,7 @@ def test_without_ray_the_extra_is_named(monkeypatch):
 
 _CUT_OFF = """
 import sys, time
-from neuroslam.parallel import parallel_map
+from neuroslam.runs.parallel import parallel_map
 if __name__ == "__main__":
     parallel_map(exec, ["import os, time; print(os.getpid(), flush=True); time.sleep(60)"] * 3, 2)
 """

@@ -17,8 +17,8 @@ from neuroslam.cells.place import (
     place_response,
 )
 from neuroslam.config import GridCellConfig, PlaceCellConfig
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
 
 CONFIG = PlaceCellConfig()
 FIRST_WINDOW = 32

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from neuroslam import place_drawing as pd
-from neuroslam.plotting import render, save
-from neuroslam.sensors.arena import named_arena
+from neuroslam.figures import places as pd
+from neuroslam.figures.maps import render, save
 from neuroslam.types import Pose
+from neuroslam.worlds.arena import named_arena
 
 ARENA = named_arena("circle2m")
 RNG = np.random.default_rng(0)

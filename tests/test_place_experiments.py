@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from neuroslam.experiments import place_cells as experiment
 from neuroslam.experiments import place_lives as lives
 from neuroslam.experiments.animals import live, live_with, read_track
-from neuroslam.place_drawing import Spread
-from neuroslam.sensors.senses import NO_NOISE, SenseNoise, sense
+from neuroslam.figures.places import Spread
+from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
 
 SEEDS = (3, 8)
 MINUTES = 1.5

@@ -8,7 +8,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.font_manager import fontManager
 
-from neuroslam import drawing, plotting
+from neuroslam.figures import maps as plotting
+from neuroslam.figures import style as drawing
 from neuroslam.geometry import integrate_velocities
 from neuroslam.types import Pose, PoseEstimate
 
@@ -139,7 +140,7 @@ def test_drawing_leaves_pyplot_and_the_users_settings_alone():
 import sys, numpy as np, matplotlib
 names = ("font.size", "axes.grid", "font.family", "image.interpolation")
 before = [matplotlib.rcParams[name] for name in names]
-from neuroslam import drawing, plotting
+from neuroslam.figures import style as drawing, maps as plotting
 plotting.render(plotting.plot_map(np.zeros((2, 3)), np.array([[0, 1]])))
 print("matplotlib.pyplot" in sys.modules, before == [matplotlib.rcParams[name] for name in names])
 """

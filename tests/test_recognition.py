@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
-from neuroslam.brain.matching import find_match
-from neuroslam.brain.merge import merge
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import merge
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.runs import resolve_config
+from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
 from neuroslam.view.templates import LocalViewCells
 

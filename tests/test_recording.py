@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
 from neuroslam.errors import RunError
-from neuroslam.recording import (
+from neuroslam.runs.recording import (
     NullRecorder,
     TensorBoardRecorder,
     activity_picture,

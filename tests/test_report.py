@@ -22,7 +22,7 @@ from neuroslam.report import collect, write_report
 from neuroslam.report.collect import chosen_rows, config_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
-from neuroslam.runs import resume, run
+from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 
 WORLD = "world:ellipse?laps=2&width=96&height=24&frames_per_lap=90&people=2"

@@ -15,8 +15,8 @@ import pytest
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.report import write_report
-from neuroslam.run_files import RowWriter, RunPlan, read_frames
-from neuroslam.runs import RunSummary, run, write_results
+from neuroslam.runs.files import RowWriter, RunPlan, read_frames
+from neuroslam.runs.run import RunSummary, run, write_results
 from neuroslam.types import Frame, Motion, PoseEstimate, StepResult, ViewMatch
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

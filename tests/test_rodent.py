@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from neuroslam.errors import BadFrame, ConfigError, SourceError
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.sensors import open_source
-from neuroslam.sensors.arena import Arena, named_arena
 from neuroslam.sensors.open import absolute_spec
-from neuroslam.sensors.rodent import Walk, ornstein_uhlenbeck, ratinabox_walk, read_walk, roam
-from neuroslam.sensors.senses import NO_NOISE, ArenaSource, SenseNoise, sense
 from neuroslam.types import Pose
+from neuroslam.worlds.arena import Arena, named_arena
+from neuroslam.worlds.rodent import Walk, ornstein_uhlenbeck, ratinabox_walk, read_walk, roam
+from neuroslam.worlds.senses import NO_NOISE, ArenaSource, SenseNoise, sense
 
 ARENAS = [
     *("triangle", "square", "pentagon", "nonagon", "circle1m", "circle2m", "rectangle"),

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from neuroslam.cli import main
-from neuroslam.recording import TensorBoardRecorder
-from neuroslam.run_files import RUN_FILES, read_frames, read_trace
-from neuroslam.runs import run
+from neuroslam.runs.files import RUN_FILES, read_frames, read_trace
+from neuroslam.runs.recording import TensorBoardRecorder
+from neuroslam.runs.run import run
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60&laps=300"
 QUICK = "--no-tensorboard"
@@ -224,7 +224,7 @@ def test_a_kill_between_any_two_files_of_the_end_leaves_a_run_that_goes_on(
     """Every file of the end is written whole; here the process dies before one of them."""
     uncut = tmp_path / "uncut"
     run(WORLD, uncut, stop=40, tensorboard=False)
-    from neuroslam import runs
+    import neuroslam.runs.run as runs
 
     for name in ("save_brain", "experiences_csv", "write_tum", "draw_map"):
         out = shutil.copytree(copy, tmp_path / name)

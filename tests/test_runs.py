@@ -19,9 +19,9 @@ from neuroslam.brain import load_brain
 from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import RunError
 from neuroslam.evaluation.trajectory import read_tum
-from neuroslam.review import evaluate, plot
-from neuroslam.run_files import TRACE_COLUMNS, read_frames, read_trace
-from neuroslam.runs import RunSummary, resolve_config, resume, run
+from neuroslam.runs.files import TRACE_COLUMNS, read_frames, read_trace
+from neuroslam.runs.review import evaluate, plot
+from neuroslam.runs.run import RunSummary, resolve_config, resume, run
 from neuroslam.sensors import open_source
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=100&laps=1.5"

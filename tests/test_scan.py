@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angles
-from neuroslam.sensors.arena import Arena, named_arena
 from neuroslam.sensors.scan import walls_in_scan
+from neuroslam.worlds.arena import Arena, named_arena
 
 REACH_M, BEAMS = 0.3, 180
 BLOCK = Arena(

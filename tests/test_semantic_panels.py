@@ -5,10 +5,10 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.tensorboard import SummaryWriter
 
+from neuroslam.config.semantic import PathIntegratorConfig, SSPSLAMConfig
 from neuroslam.experiments.ssp_lives import slam_in, views
-from neuroslam.semantic_panels import SemanticPanels
-from neuroslam.semantic_sections import PathIntegratorConfig, SSPSLAMConfig
-from neuroslam.sensors.landmarks import make_world, point
+from neuroslam.runs.semantic_panels import SemanticPanels
+from neuroslam.worlds.landmarks import make_world, point
 
 
 def test_panels_are_written(tmp_path):

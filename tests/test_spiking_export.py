@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig
 from neuroslam.errors import ConfigError
-from neuroslam.semantic_sections import NeuronConfig, PathIntegratorConfig
 from neuroslam.spiking.export import export_nir
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.space import SSPSpace

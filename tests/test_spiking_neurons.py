@@ -6,7 +6,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.ensemble import NeuronArray, sample_tuning, solve_decoders

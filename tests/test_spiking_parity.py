@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam.semantic_sections import NeuronConfig, PathIntegratorConfig, SemanticMapConfig
+from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig, SemanticMapConfig
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.space import SSPSpace

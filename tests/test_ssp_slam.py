@@ -4,23 +4,23 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam.errors import CheckpointError, SpaceError
-from neuroslam.experiments.ssp_lives import integrate, live, recalled, slam_in, views
-from neuroslam.semantic_sections import (
+from neuroslam.config.semantic import (
     NeuronConfig,
     PathIntegratorConfig,
     SemanticMapConfig,
     SSPSLAMConfig,
     SSPSpaceConfig,
 )
-from neuroslam.sensors.landmark_paths import LandmarkPath, band_limited_path
-from neuroslam.sensors.landmarks import make_world, paper_world, point, random_world
+from neuroslam.errors import CheckpointError, SpaceError
+from neuroslam.experiments.ssp_lives import integrate, live, recalled, slam_in, views
 from neuroslam.spiking import queries
 from neuroslam.spiking.files import load_semantic_map, save_semantic_map
 from neuroslam.spiking.joining import merge_semantic_maps
 from neuroslam.spiking.path_integrator import PathIntegrator, module_pull
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
+from neuroslam.worlds.landmarks import make_world, paper_world, point, random_world
 
 VECTORS = {"tier": "algebraic", "time_step_s": 0.01}
 SMALL = {

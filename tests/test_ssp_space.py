@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import SpaceError
-from neuroslam.semantic_sections import SSPSpaceConfig
 from neuroslam.spiking.algebra import bind, identity, invert, make_unitary, similarity, unbind
 from neuroslam.spiking.decoding import LearnedDecoder, PositionDecoder, probability
 from neuroslam.spiking.frequencies import simplex

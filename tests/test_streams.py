@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from neuroslam.errors import BadFrame, SourceError
 from neuroslam.sensors import open_source
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.sensors.senses import ArenaSource
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.streams import SAME_TIME_S, Streams
 from neuroslam.types import Frame, Pose, Velocity
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
+from neuroslam.worlds.senses import ArenaSource
 
 
 class Listed(IndexedSource):

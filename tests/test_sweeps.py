@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from neuroslam import load_brain
-from neuroslam.checked_files import tensors_digest
 from neuroslam.errors import ConfigError, NeuroslamError, RunError, SourceError
-from neuroslam.run_files import RUN_FILES, TIMINGS
+from neuroslam.figures.sweep import plot_sweep
+from neuroslam.runs.files import RUN_FILES, TIMINGS
+from neuroslam.runs.sweep import given, parse_values, plan_sweep, sweep
 from neuroslam.sensors.open import seeded_spec
-from neuroslam.sweep_drawing import plot_sweep
-from neuroslam.sweeps import given, parse_values, plan_sweep, sweep
+from neuroslam.state.files import tensors_digest
 
 WORLD = "world:ellipse?laps=1&width=64&height=32&noise=0.05"
 VARY = ["view.threshold=0.03,0.06"]

@@ -16,10 +16,10 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, build_config, read_config_file, read_preset
 from neuroslam.errors import BadFrame, RunError, SourceError
-from neuroslam.plotting import render
+from neuroslam.figures.maps import render
+from neuroslam.figures.tuning import plot_tuning
 from neuroslam.sensors import open_source
 from neuroslam.tuning import tune
-from neuroslam.tuning.drawing import plot_tuning
 from neuroslam.tuning.drive import key_frames, read_drive
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG, Shifts, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.config import PoseCellConfig, ViewConfig
 from neuroslam.errors import BadFrame, ConfigError, MapError
-from neuroslam.runs import resolve_config
+from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
 from neuroslam.view import LocalViewCells
 from neuroslam.view.preprocess import block_mean, encode, normalise_mean, normalise_patches

@@ -4,7 +4,7 @@ import sys
 import pytest
 import torch
 
-from neuroslam import vision
+from neuroslam.view import vision
 
 
 def run_fresh(code: str) -> str:
@@ -16,14 +16,14 @@ def run_fresh(code: str) -> str:
 
 
 def test_importing_the_module_does_not_import_torchvision():
-    code = "import sys, neuroslam.vision; print('torchvision' in sys.modules)"
+    code = "import sys, neuroslam.view.vision; print('torchvision' in sys.modules)"
     assert run_fresh(code) == "False"
 
 
 def test_a_fresh_process_gets_grids_and_transforms_through_it_and_may_then_import_torchvision():
     code = """
 import torch
-from neuroslam.vision import make_grid, transforms
+from neuroslam.view.vision import make_grid, transforms
 import torchvision
 print(tuple(make_grid(torch.zeros(4, 3, 5, 6), nrow=2, padding=1).shape))
 print(tuple(transforms.Resize((2, 3))(torch.zeros(1, 8, 8)).shape))
@@ -37,7 +37,7 @@ try:
     import torchvision
 except RuntimeError:
     pass
-from neuroslam import vision
+from neuroslam.view import vision
 print(vision.load().extension._has_ops() in (True, False), vision.make_grid.__name__)
 """
     assert run_fresh(code) == "True make_grid"

@@ -11,9 +11,9 @@ from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, 
 from neuroslam.cells.walls import OWN, WallMemory, check_motion
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
-from neuroslam.sensors.arena import Arena, named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.sensors.senses import NO_NOISE, SenseNoise, sense
+from neuroslam.worlds.arena import Arena, named_arena
+from neuroslam.worlds.rodent import roam
+from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
 
 ALIKE = {"speed_scale": 0.0, "heading_slow_deg": 0.0, "period_s": 0.0}
 """Errors of motion that are alike in all directions."""

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from neuroslam.errors import SourceError
 from neuroslam.geometry import integrate_velocities, wrap_angles
-from neuroslam.sensors.render import Camera, cast, render
-from neuroslam.sensors.scene import Surface, World, rounded_route
-from neuroslam.sensors.world import OdometryNoise, WorldOptions, WorldSource, open_world
-from neuroslam.sensors.worlds import Sense, build_world, catalogue
 from neuroslam.types import Pose
+from neuroslam.worlds.catalogue import Sense, build_world, catalogue
+from neuroslam.worlds.render import Camera, cast, render
+from neuroslam.worlds.scene import Surface, World, rounded_route
+from neuroslam.worlds.world import OdometryNoise, WorldOptions, WorldSource, open_world
 
 NAMES = list(catalogue())
 EVERYTHING = "world:corridor?noise=0.05&light=0.3&people=3&seed=5"

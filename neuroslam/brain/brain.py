@@ -10,11 +10,7 @@ import torch
 from torch import nn
 
 from neuroslam.brain.continuity import Continuity
-from neuroslam.brain.limits import WINDOW, elsewhere, tolerance
-from neuroslam.brain.matching import shared_history
-from neuroslam.brain.merge import Match, differing, merge
 from neuroslam.brain.recognition import Recognition, StoredViews
-from neuroslam.brain.sessions import Session, SessionLog, session_id
 from neuroslam.cells.boundary import checked_walls
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
@@ -23,8 +19,10 @@ from neuroslam.errors import BadFrame, ConfigError, counted
 from neuroslam.geometry import TWO_PI, compose, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
+from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
+from neuroslam.merging.match import shared_history
+from neuroslam.merging.merge import Match, differing, merge
 from neuroslam.odometry.visual import VisualOdometry
-from neuroslam.population import Population, Running, State
 from neuroslam.sensors.frames import (
     check_instant,
     check_picture,
@@ -35,7 +33,9 @@ from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.spiking.sightings import VIEW, Guide, Sightings, Told
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Population, Running, State
+from neuroslam.state.sessions import Session, SessionLog, session_id
+from neuroslam.state.tables import Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,

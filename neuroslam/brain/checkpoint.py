@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
-from neuroslam.brain.sessions import Session, session_id
-from neuroslam.checked_files import first_line, load_checked, save_checked
+from neuroslam.state.sessions import Session, session_id
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError
+from neuroslam.state.files import first_line, load_checked, save_checked
 
 FORMAT_VERSION = 3
 

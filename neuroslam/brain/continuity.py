@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from neuroslam.config import BrainConfig
-from neuroslam.population import Running
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Running
+from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
 from neuroslam.view.search import Geometry, distances
 from neuroslam.view.templates import to_bytes

@@ -7,8 +7,8 @@ import torch
 
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
-from neuroslam.population import Join, Population, State
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.templates import LocalViewCells
 

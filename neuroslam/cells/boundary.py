@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Running
 from neuroslam.sensors.frames import checked_array
+from neuroslam.state.population import Running
 
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
 """Zones of the activity of boundary cells, from far to near."""

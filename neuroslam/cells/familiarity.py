@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Running, without_gradients
+from neuroslam.state.population import Running, without_gradients
 
 SURE = 0.6
 """Share of the reach within which a wall cannot be overlooked."""

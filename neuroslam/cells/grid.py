@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from neuroslam.cells.oscillators import wave_vectors
 from neuroslam.config import GridCellConfig
-from neuroslam.population import Running
+from neuroslam.state.population import Running
 
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0

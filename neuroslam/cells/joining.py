@@ -13,7 +13,7 @@ from neuroslam.cells.grid import lahn_drive
 from neuroslam.cells.oscillators import turn_phases, wave_vectors
 from neuroslam.cells.place import EMPTY, FAR_M, NEIGHBOURS
 from neuroslam.geometry import TWO_PI, wrap_angle
-from neuroslam.population import Join, State
+from neuroslam.state.population import Join, State
 from neuroslam.types import Pose
 
 

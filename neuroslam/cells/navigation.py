@@ -17,9 +17,9 @@ from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
-from neuroslam.population import Join, Population, State, without_gradients
 from neuroslam.sensors.frames import checked_number
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State, without_gradients
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, Pose, ViewMatch
 
 FAMILIARITY_PERIOD_S = 0.5

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.config import GridCellConfig
-from neuroslam.population import Running
+from neuroslam.state.population import Running
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:

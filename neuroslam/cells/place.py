@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from neuroslam.config import PlaceCellConfig
-from neuroslam.population import Running, without_gradients
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Running, without_gradients
+from neuroslam.state.tables import Scalars
 
 NEIGHBOURS = 12
 """Links of a place cell to others that were active before or after it, at most."""

@@ -19,8 +19,8 @@ from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_to
 from neuroslam.config import PoseCellConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Join, Population, State, renamed
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State, renamed
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
 _TIRED = math.log(30.0) / 1.2

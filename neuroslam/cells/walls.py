@@ -16,8 +16,8 @@ from torch import Tensor
 from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, wrap
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
-from neuroslam.population import Running, without_gradients
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Running, without_gradients
+from neuroslam.state.tables import Scalars
 
 OWN = 4
 """First rows of the covariance: position x and y, share of the speed too much, compass error."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from neuroslam.errors import MapError, SourceError
 from neuroslam.geometry import wrap_angles
-from neuroslam.storage import write_atomically
+from neuroslam.state.tables import write_atomically
 
 AlignmentMode = Literal["none", "rigid", "similarity"]
 

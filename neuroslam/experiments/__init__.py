@@ -56,7 +56,7 @@ def run_experiment(
         name: One of ``EXPERIMENTS``.
         data: Folder that holds the folders of the recordings; ``None`` if it needs none.
         out: Folder to write.
-        jobs: As for :func:`neuroslam.parallel.parallel_map`, where it has independent lives.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`, where it has independent lives.
         ray: The same.
         networks: ``view.features`` -> file of weights, where it compares views.
 

@@ -10,8 +10,8 @@ import torch
 from neuroslam.cells.navigation import NavigationCells, Whereabouts
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.sensors.rodent import Walk, read_walk
-from neuroslam.sensors.senses import SenseNoise, Senses, sense
+from neuroslam.worlds.rodent import Walk, read_walk
+from neuroslam.worlds.senses import SenseNoise, Senses, sense
 
 TRACKS = {
     "triangle": "simulated_triangle.npz",

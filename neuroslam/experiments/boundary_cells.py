@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.cell_drawing import Approach, Firing, plot_approaches, plot_firing_maps
 from neuroslam.cells.boundary import (
     ATTENUATION,
     GROWTH,
@@ -23,10 +22,11 @@ from neuroslam.cells.boundary import (
 )
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.evaluation.ratemap import Bins, rate_map
-from neuroslam.plotting import save
-from neuroslam.sensors.arena import named_arena
-from neuroslam.sensors.rodent import roam
-from neuroslam.storage import write_atomically
+from neuroslam.figures.cells import Approach, Firing, plot_approaches, plot_firing_maps
+from neuroslam.figures.maps import save
+from neuroslam.state.tables import write_atomically
+from neuroslam.worlds.arena import named_arena
+from neuroslam.worlds.rodent import roam
 
 SPEED_M_S = 0.15
 RATE_HZ = 100.0

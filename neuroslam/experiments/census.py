@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.cell_drawing import Firing
 from neuroslam.cells.navigation import NavigationCells, Whereabouts
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps, fields
 from neuroslam.experiments.animals import live
-from neuroslam.sensors.rodent import Walk
-from neuroslam.sensors.senses import SenseNoise
+from neuroslam.figures.cells import Firing
+from neuroslam.worlds.rodent import Walk
+from neuroslam.worlds.senses import SenseNoise
 
 _PIECE = 1200  # steps whose rates are held before they are added to the maps
 

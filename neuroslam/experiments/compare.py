@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.comparison_drawing import plot_comparison, plot_losses
 from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.figures.comparison import plot_comparison, plot_losses
+from neuroslam.figures.maps import save
 from neuroslam.geometry import integrate_velocities
-from neuroslam.parallel import one_thread, parallel_map
-from neuroslam.plotting import save
+from neuroslam.runs.parallel import one_thread, parallel_map
 from neuroslam.sensors import open_source
 from neuroslam.types import NO_EXPERIENCE, Frame, Pose
 
@@ -126,7 +126,7 @@ def compare(
         laps: Of each drive; drives that lose a sense are six laps of the first world.
         methods: Of ``METHODS``.
         losses: Of ``LOSSES``.
-        jobs: As for :func:`neuroslam.parallel.parallel_map`: drives side by side.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives side by side.
         ray: The same.
 
     Returns:
@@ -187,7 +187,7 @@ def pixel_landmarks(
         out_folder: ``results.json`` is written there.
         seeds: Of the noise; one drive for each.
         laps: Of each drive.
-        jobs: As for :func:`neuroslam.parallel.parallel_map`: drives side by side.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives side by side.
         ray: The same.
 
     Returns:

@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuroslam.drawing import LOOP, MAP, ODOMETRY, OTHER, TRUTH
 from neuroslam.errors import SourceError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
+from neuroslam.figures.maps import save
+from neuroslam.figures.style import LOOP, MAP, ODOMETRY, OTHER, TRUTH
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.relax import Relaxation
-from neuroslam.plotting import save
-from neuroslam.storage import write_atomically
+from neuroslam.state.tables import write_atomically
 
 SCORES = (0.0, 0.5, 0.7, 0.8, 0.9)
 """Least scores of the matches that are used."""

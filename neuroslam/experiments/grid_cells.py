@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from neuroslam.cell_drawing import Curve, Firing, plot_firing, plot_scores
 from neuroslam.config import BrainConfig, GridCellConfig
-from neuroslam.drawing import CURVES, MAP, TRUTH
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import spike_map
 from neuroslam.experiments.animals import TRACKS, read_track
@@ -27,8 +25,10 @@ from neuroslam.experiments.census import (
     median,
     median_cell,
 )
-from neuroslam.plotting import save
-from neuroslam.sensors.rodent import Walk, read_walk
+from neuroslam.figures.cells import Curve, Firing, plot_firing, plot_scores
+from neuroslam.figures.maps import save
+from neuroslam.figures.style import CURVES, MAP, TRUTH
+from neuroslam.worlds.rodent import Walk, read_walk
 
 PAPER_TABLE_1 = {
     "triangle": (0.25, 0.32, 0.38, 0.45, 0.55, 0.56, 0.68, 0.69, 0.74, 0.73, 0.74, 0.74),

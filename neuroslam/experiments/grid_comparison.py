@@ -14,12 +14,10 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from neuroslam.cell_drawing import Curve, Firing, plot_encounters, plot_grids, plot_scores
 from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.sheet import GridSheet, SheetParameters
 from neuroslam.config import BrainConfig, GridCellConfig
-from neuroslam.drawing import CURVES, LOOP, MAP, ROBOT, TRUTH
 from neuroslam.experiments.animals import WALLS, read_track
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.census import (
@@ -31,9 +29,11 @@ from neuroslam.experiments.census import (
     median,
     median_cell,
 )
-from neuroslam.plotting import save
-from neuroslam.sensors.rodent import Walk
-from neuroslam.sensors.senses import NO_NOISE, SenseNoise, Senses, sense
+from neuroslam.figures.cells import Curve, Firing, plot_encounters, plot_grids, plot_scores
+from neuroslam.figures.maps import save
+from neuroslam.figures.style import CURVES, LOOP, MAP, ROBOT, TRUTH
+from neuroslam.worlds.rodent import Walk
+from neuroslam.worlds.senses import NO_NOISE, SenseNoise, Senses, sense
 
 PAPER_TABLE_2 = {
     "cells": (103, 195, 274, 318, 378, 421, 472, 503, 498),

@@ -10,10 +10,10 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.icp import fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, shape_rmse
+from neuroslam.figures.sessions import Bindings, Stage
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.tables import closes_loop
-from neuroslam.merge_drawing import Bindings, Stage
-from neuroslam.run_files import trajectory
+from neuroslam.runs.files import trajectory
 from neuroslam.types import Frame
 
 _TRACE = ("session", "number", "dx_m", "dy_m", "dtheta_rad", "truth_x_m", "truth_y_m")

@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroslam.brain.matching import find_match
+from neuroslam.merging.match import find_match
 from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
 from neuroslam.evaluation.icp import map_rmse
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.lives import Life, bindings, live, measure, stages, track
-from neuroslam.merge_drawing import plot_accuracy, plot_bindings, plot_overlay, plot_stages
-from neuroslam.plotting import save
+from neuroslam.figures.maps import save
+from neuroslam.figures.sessions import plot_accuracy, plot_bindings, plot_overlay, plot_stages
 from neuroslam.sensors import Source, open_source
-from neuroslam.storage import write_atomically
+from neuroslam.state.tables import write_atomically
 
 Cut = tuple[int, int]
 """First frame of a session, and the frame before which it ends."""

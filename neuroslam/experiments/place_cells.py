@@ -42,8 +42,8 @@ from neuroslam.experiments.place_lives import (
     TrackResult,
     run_track,
 )
-from neuroslam.parallel import parallel_map
-from neuroslam.place_drawing import (
+from neuroslam.figures.maps import save
+from neuroslam.figures.places import (
     PathTold,
     PlaceMap,
     Response,
@@ -55,9 +55,9 @@ from neuroslam.place_drawing import (
     plot_responses,
     plot_sweep,
 )
-from neuroslam.plotting import save
-from neuroslam.sensors.senses import SenseNoise, sense
-from neuroslam.storage import write_atomically
+from neuroslam.runs.parallel import parallel_map
+from neuroslam.state.tables import write_atomically
+from neuroslam.worlds.senses import SenseNoise, sense
 
 PAPER = {
     "mean_error_m": 0.031,
@@ -201,7 +201,7 @@ def place_map(
         tracks: Which of them.
         minutes: How long; Sargolini's rat at most its 20 min.
         seeds: Of the noise; one life each.
-        jobs: As for :func:`neuroslam.parallel.parallel_map`: tracks side by side.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: tracks side by side.
         ray: The same; the folders are on a disk that all machines share.
 
     Returns:

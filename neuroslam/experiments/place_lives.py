@@ -15,11 +15,11 @@ from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.experiments.animals import WALLS, live_with, path_integration, read_track
+from neuroslam.figures.places import Spread
 from neuroslam.geometry import TWO_PI, wrap_angles
-from neuroslam.place_drawing import Spread
-from neuroslam.sensors.rodent import Walk
-from neuroslam.sensors.senses import SenseNoise, Senses, sense
 from neuroslam.types import Motion
+from neuroslam.worlds.rodent import Walk
+from neuroslam.worlds.senses import SenseNoise, Senses, sense
 
 FULL, WEAK, EASY = "noise 1.0", "noise 0.3", "noise 1.0, bearings from the compass"
 """Conditions: how the senses err."""

@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuroslam.errors import SourceError
-from neuroslam.evaluation.gridness import gridness
-from neuroslam.evaluation.ratemap import Bins, RateMaps
-from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.ssp_lives import slam_in, views
-from neuroslam.plotting import save
-from neuroslam.semantic_sections import (
+from neuroslam.config.semantic import (
     PathIntegratorConfig,
     SemanticMapConfig,
     SSPSLAMConfig,
     SSPSpaceConfig,
 )
-from neuroslam.sensors.landmark_paths import LandmarkPath, path_of_walk
-from neuroslam.sensors.landmarks import LandmarkWorld, random_world
-from neuroslam.sensors.rodent import read_walk
-from neuroslam.spike_drawing import Headings, Spikes, plot_rasters, plot_signals, plot_spikes
+from neuroslam.errors import SourceError
+from neuroslam.evaluation.gridness import gridness
+from neuroslam.evaluation.ratemap import Bins, RateMaps
+from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.experiments.ssp_lives import slam_in, views
+from neuroslam.figures.maps import save
+from neuroslam.figures.spikes import Headings, Spikes, plot_rasters, plot_signals, plot_spikes
 from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.worlds.landmark_paths import LandmarkPath, path_of_walk
+from neuroslam.worlds.landmarks import LandmarkWorld, random_world
+from neuroslam.worlds.rodent import read_walk
 
 _BIN_M = 0.05
 _PIECE = 1000

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig, SSPSpaceConfig
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.plotting import save
-from neuroslam.semantic_sections import NeuronConfig, PathIntegratorConfig, SSPSpaceConfig
-from neuroslam.sensors.landmark_paths import LandmarkPath, read_kitti
-from neuroslam.spike_drawing import Run, plot_dead_reckoning
+from neuroslam.figures.maps import save
+from neuroslam.figures.spikes import Run, plot_dead_reckoning
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.quantise import quantised
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.worlds.landmark_paths import LandmarkPath, read_kitti
 
 PAPER_NEURONS = 90_000
 SPACE = SSPSpaceConfig(dimension=3, n_rotations=3, n_scales=3, length_scale_m=0.3)

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.semantic_sections import SSPSLAMConfig
-from neuroslam.sensors.landmark_paths import LandmarkPath, band_limited_path
-from neuroslam.sensors.landmarks import LandmarkView, LandmarkWorld, make_world, point
+from neuroslam.config.semantic import SSPSLAMConfig
 from neuroslam.spiking.pointers import SemanticPointers
 from neuroslam.spiking.slam import SSPSLAM, SSPStep
+from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
+from neuroslam.worlds.landmarks import LandmarkView, LandmarkWorld, make_world, point
 
 KEPT_HZ = 100
 """Of what is said, so much is kept for figures and figures of merit."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from neuroslam.config.semantic import PathIntegratorConfig, SSPSLAMConfig, SSPSpaceConfig
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.ssp_lives import (
     Life,
@@ -14,11 +15,10 @@ from neuroslam.experiments.ssp_lives import (
     slam_in,
     trials,
 )
-from neuroslam.plotting import save
-from neuroslam.semantic_sections import PathIntegratorConfig, SSPSLAMConfig, SSPSpaceConfig
-from neuroslam.sensors.landmark_paths import LandmarkPath, band_limited_path
-from neuroslam.sensors.landmarks import LandmarkWorld, random_world
-from neuroslam.spike_drawing import plot_3d, plot_errors, plot_trials
+from neuroslam.figures.maps import save
+from neuroslam.figures.spikes import plot_3d, plot_errors, plot_trials
+from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
+from neuroslam.worlds.landmarks import LandmarkWorld, random_world
 
 PAPER = {"SLAM": (0.0529, 0.0315), "path integration": (0.7876, 0.2958)}
 """Absolute trajectory error and its spread, about 480 000 neurons."""

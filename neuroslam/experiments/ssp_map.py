@@ -6,21 +6,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.ssp_lives import live, pointers_of, recalled, slam_in, views
-from neuroslam.plotting import save
-from neuroslam.semantic_drawing import Query, plot_area, plot_posterior, plot_queries, plot_vectors
-from neuroslam.semantic_sections import (
+from neuroslam.config.semantic import (
     PathIntegratorConfig,
     SemanticMapConfig,
     SSPSLAMConfig,
     SSPSpaceConfig,
 )
-from neuroslam.sensors.landmark_paths import LandmarkPath, band_limited_path
-from neuroslam.sensors.landmarks import LandmarkWorld, paper_world, random_world
+from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.experiments.ssp_lives import live, pointers_of, recalled, slam_in, views
+from neuroslam.figures.landmarks import Query, plot_area, plot_posterior, plot_queries, plot_vectors
+from neuroslam.figures.maps import save
 from neuroslam.spiking import queries
 from neuroslam.spiking.decoding import probability
 from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
+from neuroslam.worlds.landmarks import LandmarkWorld, paper_world, random_world
 
 _GRID = 81  # points a side of a similarity map
 _RIGHT_M = 0.05

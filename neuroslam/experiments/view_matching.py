@@ -15,7 +15,6 @@ import matplotlib as mpl
 import numpy as np
 
 from neuroslam.config import ViewConfig, build_config
-from neuroslam.drawing import STYLE, write_title
 from neuroslam.errors import SourceError
 from neuroslam.evaluation.place import (
     PrecisionRecall,
@@ -23,9 +22,10 @@ from neuroslam.evaluation.place import (
     precision_recall,
     recall_at_full_precision,
 )
-from neuroslam.plotting import plot_precision_recall, save
+from neuroslam.figures.maps import plot_precision_recall, save
+from neuroslam.figures.style import STYLE, write_title
 from neuroslam.sensors import open_source
-from neuroslam.storage import write_atomically
+from neuroslam.state.tables import write_atomically
 from neuroslam.view import LocalViewCells
 from neuroslam.view.search import distances as sums_of_differences
 from neuroslam.view.templates import to_bytes

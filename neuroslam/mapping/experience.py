@@ -22,8 +22,8 @@ from neuroslam.mapping.tables import (
     closes_loop,
     origin_key,
 )
-from neuroslam.population import Join, Population, State
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,

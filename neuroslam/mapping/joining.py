@@ -7,7 +7,7 @@ import torch
 
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.tables import ALIAS_COLUMNS, Links, origin_key
-from neuroslam.population import Join, State, renamed
+from neuroslam.state.population import Join, State, renamed
 from neuroslam.types import NO_TEMPLATE
 
 _PROVENANCE = ("first_frame", "session", "number")

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.config.sections import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.population import Running
-from neuroslam.sections import OdometryConfig, Region
 from neuroslam.sensors.frames import check_picture
-from neuroslam.storage import Scalars
+from neuroslam.state.population import Running
+from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
 
 

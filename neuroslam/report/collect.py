@@ -8,13 +8,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.brain.merge import MergeReport
+from neuroslam.merging.merge import MergeReport
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.report.reading import Curve, FinishedRun
-from neuroslam.run_files import TIMINGS, odometry_track, places_of, trajectory, true_poses
+from neuroslam.runs.files import TIMINGS, odometry_track, places_of, trajectory, true_poses
 
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000

@@ -15,7 +15,7 @@ from neuroslam.errors import RunError
 from neuroslam.report.collect import Facts, collect
 from neuroslam.report.pictures import Pictures, take_pictures
 from neuroslam.report.reading import read_run
-from neuroslam.run_files import LANDMARKS_FILE, RUN_FILES, write_text
+from neuroslam.runs.files import LANDMARKS_FILE, RUN_FILES, write_text
 
 SCRIPTS = (
     "data.js", "view.js", "map.js", "marks.js", "charts.js", "cells.js", "panels.js", "tables.js",

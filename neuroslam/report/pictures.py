@@ -9,7 +9,7 @@ import numpy as np
 
 from neuroslam.errors import SourceError
 from neuroslam.report.reading import FinishedRun, session_plans
-from neuroslam.run_files import RunPlan
+from neuroslam.runs.files import RunPlan
 from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame

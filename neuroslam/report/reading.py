@@ -8,7 +8,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import NeuroslamError, RunError
-from neuroslam.run_files import (
+from neuroslam.runs.files import (
     RunPlan,
     brain_file,
     frame_rows,

@@ -10,9 +10,9 @@ import numpy as np
 from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.frames import check_picture
-from neuroslam.sensors.render import cast
-from neuroslam.sensors.scene import Billboard, World
 from neuroslam.types import Pose
+from neuroslam.worlds.render import cast
+from neuroslam.worlds.scene import Billboard, World
 
 _MODULE_PX = 12  # of a painted marker
 _SMALL_PX = 480  # narrower pictures are enlarged: the detector needs a few pixels a module

@@ -15,9 +15,7 @@ from neuroslam.sensors.images import (
     open_tar,
     read_text,
 )
-from neuroslam.sensors.rodent import ARENA_KEYS, read_walk
 from neuroslam.sensors.rosbag import is_bag, open_bag
-from neuroslam.sensors.senses import ArenaSource, open_arena
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import TrackSource, parse_motion, read_positions, read_track
@@ -44,12 +42,12 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     ``list.txt``, ``list.csv``          image list (:mod:`neuroslam.sensors.images`)
     ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
-    ``rat.npz`` with an arena in it     the same, and its walls (:mod:`neuroslam.sensors.rodent`)
+    ``rat.npz`` with an arena in it     the same, and its walls (:mod:`neuroslam.worlds.rodent`)
     TUM, KITTI or EuRoC folder          pictures and truth (:mod:`neuroslam.sensors.datasets`)
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
     ``world:NAME``                      a world rendered on the fly
-    ``arena:NAME``, ``arena:rat.npz``   a walk sensed with noise (:mod:`neuroslam.sensors.senses`)
+    ``arena:NAME``, ``arena:rat.npz``   a walk sensed with noise (:mod:`neuroslam.worlds.senses`)
     ``drive.avi+motion.csv``            two of these merged by time: a camera, and motion
                                         (:mod:`neuroslam.sensors.streams`)
     ==================================  ========================================================
@@ -75,10 +73,12 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
         if parts := _parts(str(spec)):
             return Streams(*(open_source(part, frame_rate_hz) for part in parts))
         if isinstance(spec, str) and spec.startswith("world:"):
-            from neuroslam.sensors.world import open_world  # only who renders pays for its import
+            from neuroslam.worlds.world import open_world  # worlds build on readers of files
 
             return open_world(spec)
         if isinstance(spec, str) and spec.startswith("arena:"):
+            from neuroslam.worlds.senses import open_arena
+
             return open_arena(spec)
         if isinstance(spec, str) and spec.startswith("camera:"):
             return CameraSource(spec.removeprefix("camera:"))
@@ -197,6 +197,9 @@ def _open_table(path: Path, frame_rate_hz: float) -> Source:
 
 def _open_positions(path: Path, frame_rate_hz: float) -> Source:
     """Open a track, with its walls if it has an arena."""
+    from neuroslam.worlds.rodent import ARENA_KEYS, read_walk
+    from neuroslam.worlds.senses import ArenaSource
+
     if any(key in read_positions(path)[0] for key in ARENA_KEYS):
         return ArenaSource(read_walk(path))
     return TrackSource(read_track(path, frame_rate_hz), frame_rate_hz)

@@ -34,7 +34,7 @@ class Streams(Source):
             far as can be told without reading on; else reading says so.
 
     Example:
-        >>> from neuroslam.sensors.world import open_world
+        >>> from neuroslam.worlds.world import open_world
         >>> camera = open_world("world:corridor?laps=0.01&rate=10")
         >>> wheels = open_world("world:corridor?laps=0.01&rate=20&odometry=true")
         >>> frames = list(Streams(camera, wheels))

@@ -5,10 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import PathIntegratorConfig, SemanticMapConfig
+from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig
 from neuroslam.spiking.path_integrator import Packet, coupled
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.state.population import Running
 
 
 class AlgebraicIntegrator(Packet):

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig, SemanticMapConfig
+from neuroslam.config.semantic import NeuronConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     Tuning,
@@ -15,6 +14,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.learning import pes_step, voja_step
+from neuroslam.state.population import Running
 
 _SOLVER_POINTS = 3000
 _TAU_RECALL_S = 0.005

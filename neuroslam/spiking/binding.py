@@ -5,8 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     lowpass,
@@ -14,6 +13,7 @@ from neuroslam.spiking.ensemble import (
     solve_decoders,
     synapse,
 )
+from neuroslam.state.population import Running
 
 _SOLVER_POINTS = 1000
 _RADIUS = math.sqrt(2.0)  # of a sum or difference of two numbers of at most 1, over root 2

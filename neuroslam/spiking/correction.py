@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.ensemble import (
     NeuronArray,
@@ -13,6 +12,7 @@ from neuroslam.spiking.ensemble import (
     solve_decoders,
     synapse,
 )
+from neuroslam.state.population import Running
 
 _SOLVER_POINTS = 3000
 _VETO_NEURONS = 50

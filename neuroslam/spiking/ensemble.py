@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.neurons import (
     LIFState,
     Membrane,
@@ -17,6 +16,7 @@ from neuroslam.spiking.neurons import (
     stepped_lif,
     stepped_lif_rate,
 )
+from neuroslam.state.population import Running
 
 
 class Tuning(NamedTuple):

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from neuroslam.checked_files import first_line, load_checked, save_checked
+from neuroslam.config.semantic import SSPSLAMConfig
 from neuroslam.errors import CheckpointError
-from neuroslam.semantic_sections import SSPSLAMConfig
 from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.state.files import first_line, load_checked, save_checked
 
 FORMAT_VERSION = 1
 _KIND = "semantic map"

@@ -6,8 +6,8 @@ from itertools import combinations
 
 import numpy as np
 
-from neuroslam.population import State
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED
+from neuroslam.state.population import State
 from neuroslam.types import Pose
 
 

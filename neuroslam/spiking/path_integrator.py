@@ -5,9 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig
 from neuroslam.errors import SpaceError
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig, PathIntegratorConfig
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.ensemble import (
     NeuronArray,
@@ -17,6 +16,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.state.population import Running
 
 _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig
+from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     lowpass,
@@ -13,6 +12,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
 )
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.state.population import Running
 
 _SOLVER_POINTS = 3000
 TAU_S = 0.01

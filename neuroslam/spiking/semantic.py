@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angle
-from neuroslam.population import Join, Population, State, without_gradients
-from neuroslam.semantic_sections import SemanticConfig
-from neuroslam.sensors.landmarks import LandmarkView
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED, NAMELESS, VIEW, Guide, Sightings, Told
 from neuroslam.spiking.slam import SSPSLAM, SSPStep
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State, without_gradients
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import Motion, Pose
+from neuroslam.worlds.landmarks import LandmarkView
 
 _KINDS = ("landmark", "view", "nameless")
 _KNOWN = 0.5  # strength of a recall from which a landmark is known

@@ -7,10 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.config.semantic import NeuronConfig, SSPSLAMConfig
 from neuroslam.errors import SpaceError
-from neuroslam.population import Running
-from neuroslam.semantic_sections import NeuronConfig, SSPSLAMConfig
-from neuroslam.sensors.landmarks import LandmarkView
 from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, region_vectors
@@ -23,6 +21,8 @@ from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.quantise import quantised
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.state.population import Running
+from neuroslam.worlds.landmarks import LandmarkView
 
 _CHUNK = 200  # steps whose inputs are prepared at once
 _GATE_WIDTH = 0.02  # of similarity, over which the gate opens

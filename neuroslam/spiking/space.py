@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import SpaceError
-from neuroslam.semantic_sections import SSPSpaceConfig
 from neuroslam.spiking import frequencies as waves
 
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from neuroslam.config.sections import Region
 from neuroslam.errors import BadFrame, SourceError, counted
-from neuroslam.sections import Region
 from neuroslam.sensors import Source
 from neuroslam.types import Frame
 from neuroslam.view.features import FeatureEncoder

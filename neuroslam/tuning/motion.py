@@ -15,8 +15,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from neuroslam.config.sections import Region
 from neuroslam.odometry.visual import column_sums, match_profiles
-from neuroslam.sections import Region
 
 FIELDS_OF_VIEW_DEG = np.arange(40.0, 181.0, 1.0)
 
@@ -42,13 +42,18 @@ class FieldOfView(NamedTuple):
 
     Attributes:
         fov_deg: The best.
-        error: Mean of :math:`1 - \cos` of the turns, for each of ``FIELDS_OF_VIEW_DEG``.
+        error: Mean of :math:`1 - \cos` of the turns, for each of ``tried_deg``.
         shifts: The region it was measured in.
     """
 
     fov_deg: float
     error: np.ndarray
     shifts: Shifts
+
+    @property
+    def tried_deg(self) -> np.ndarray:
+        """The fields of view that were compared."""
+        return FIELDS_OF_VIEW_DEG
 
 
 def measure_shifts(pictures: np.ndarray, region: Region, max_shift: int) -> Shifts:

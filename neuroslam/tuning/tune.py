@@ -11,13 +11,13 @@ import numpy as np
 from torch import nn
 
 from neuroslam.config import BrainConfig, to_toml
+from neuroslam.config.sections import ViewConfig
 from neuroslam.errors import RunError, counted
-from neuroslam.parallel import one_thread
-from neuroslam.plotting import save
-from neuroslam.run_files import write_text
-from neuroslam.sections import ViewConfig
+from neuroslam.figures.maps import save
+from neuroslam.figures.tuning import plot_tuning
+from neuroslam.runs.files import write_text
+from neuroslam.runs.parallel import one_thread
 from neuroslam.sensors import Source, open_source
-from neuroslam.tuning.drawing import plot_tuning
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting

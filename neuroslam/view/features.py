@@ -17,11 +17,11 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from neuroslam import vision
-from neuroslam.checked_files import first_line, tensors_digest
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.sensors.frames import check_picture
+from neuroslam.state.files import first_line, tensors_digest
+from neuroslam.view import vision
 from neuroslam.view.preprocess import Encoded, crop, encode
 
 Encoder = Callable[[np.ndarray], Encoded]

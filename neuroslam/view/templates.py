@@ -7,8 +7,8 @@ from torch import nn
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
-from neuroslam.population import Join, Population, State, renamed
-from neuroslam.storage import GrowingTable, Scalars
+from neuroslam.state.population import Join, Population, State, renamed
+from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
 from neuroslam.view.preprocess import Encoded

@@ -1,0 +1,1 @@
+"""Figures: plain arrays in, a matplotlib ``Figure`` out."""

@@ -1,0 +1,263 @@
+"""Figures of maps, cells, views and curves: plain arrays in, a matplotlib ``Figure`` out.
+
+:mod:`neuroslam.figures.style` has the colours and what they mean. pyplot is never touched.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from neuroslam.figures.style import (
+    CURVES,
+    STYLE,
+    as_rgb,
+    counted,
+    draw_frame,
+    draw_map,
+    draw_odometry,
+    draw_pose_cells,
+    draw_signals,
+    draw_template,
+    legend_below,
+    new_figure,
+    write_title,
+)
+from neuroslam.state.tables import write_atomically
+from neuroslam.types import Pose, PoseEstimate
+from neuroslam.view import vision
+
+
+def save(figure: Figure, path: Path, dpi: int = 150) -> None:
+    """Write a figure as PNG, whole or not at all; equal figures give equal bytes."""
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a name in a script that no font has
+        write_atomically(
+            Path(path),
+            lambda file: figure.savefig(
+                file, format="png", dpi=dpi, metadata={"Software": "neuroslam"}
+            ),
+        )
+
+
+def render(figure: Figure, dpi: int = 100) -> np.ndarray:
+    """Draw a figure into pixels: ``uint8``, ``(h, w, 3)``."""
+    figure.set_dpi(dpi)
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")
+        figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+
+
+def plot_map(
+    poses: np.ndarray,
+    links: np.ndarray,
+    *,
+    odometry_xy: np.ndarray | None = None,
+    track_xy: np.ndarray | None = None,
+    truth_xy: np.ndarray | None = None,
+    walls: np.ndarray | None = None,
+    current: Pose | None = None,
+    landmarks: np.ndarray | None = None,
+    session: np.ndarray | None = None,
+    session_names: Sequence[str] = (),
+    odometry_of: str = "",
+    title: str | None = None,
+) -> Figure:
+    """Draw the experience map, beside the odometry it was made from.
+
+    A link is a loop closure when it joins experiences that were both known before.
+    The map is in its own coordinates. ``truth_xy``, and walls with it, are drawn where a similarity
+    alignment lays them over the track, and the legend gives the absolute trajectory error (RMSE,
+    in metres of the truth).
+
+    Args:
+        poses: Experiences ``(n, 3)``: x, y in metres, heading in radians.
+        links: Source and target of each link, ``(m, 2)``.
+        odometry_xy: Dead-reckoned track ``(k, 2)``; gets a panel of its own.
+        track_xy: Where the map puts the robot in each frame, ``(t, 2)``.
+        truth_xy: Where it was in each frame, ``(t, 2)``; without ``track_xy``: at each experience.
+        walls: Ends of wall segments in the frame of the truth, ``(w, 2, 2)``.
+        current: Pose of the robot now, on the map: an arrow, which stands for the end.
+        landmarks: Where landmarks are, on the map, ``(l, 2)``: stars.
+        session: Number of the session that made each experience, ``(n,)``, from 0: its colour.
+        session_names: Of the sessions, for the legend; colours repeat after six.
+        odometry_of: Whose odometry it is, for the legend.
+        title: Heading of the whole figure.
+
+    Raises:
+        ValueError: If the truth has another length than the track.
+    """
+    with mpl.rc_context(STYLE):
+        tall = 5.6 + 0.19 * len(session_names)  # a line of the legend each
+        figure = new_figure(11.0 if odometry_xy is not None else 6.2, tall, title)
+        axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
+        if odometry_xy is not None:
+            draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of)
+        draw_map(
+            axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks, session,
+            session_names,
+        )  # fmt: skip
+    return figure
+
+
+def plot_pose_cells(
+    activity: np.ndarray,
+    estimate: PoseEstimate | None = None,
+    injection: PoseEstimate | None = None,
+) -> Figure:
+    """Draw the activity packet from above (summed over heading) and from the side (over y).
+
+    Args:
+        activity: ``(n_theta, n_y, n_x)``.
+        estimate: Decoded centre of the packet, in cells: a cross.
+        injection: Where the current view injects, in cells: a ring.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(9.0, 4.3, "Activity of the pose cells")
+        axes = figure.subplots(1, 2)
+        draw_pose_cells(figure, axes, np.asarray(activity), estimate, injection)
+    return figure
+
+
+def plot_frame_and_template(
+    image: np.ndarray, template: np.ndarray, error: float, template_id: int
+) -> Figure:
+    """Draw a frame above the stored view it was matched with.
+
+    Args:
+        image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+        template: Grey, ``(h, w)``, ``uint8`` or in [0, 1].
+        error: Mean absolute difference of the match; negative where there was none.
+        template_id: Id of the template.
+    """
+    with mpl.rc_context(STYLE):
+        ratios = [image.shape[0] / image.shape[1], template.shape[0] / template.shape[1]]
+        figure = new_figure(4.6, 4.6 * sum(ratios) + 0.7, None)
+        axes = figure.subplots(2, 1, height_ratios=ratios)
+        draw_frame(axes[0], image)
+        draw_template(axes[1], template, error, template_id)
+    return figure
+
+
+def plot_signals(frames: Mapping[str, np.ndarray], threshold: float | None = None) -> Figure:
+    """Draw how well frames were recognised, where there were views, and how the map grew.
+
+    Args:
+        frames: The columns ``time_s``, ``match_error``, ``n_templates``, ``n_experiences`` and
+            ``n_links`` of ``frames.csv``.
+        threshold: Largest match error that counts as known.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(8.0, 4.8 if np.any(frames["n_templates"]) else 2.7, None)
+        draw_signals(figure, frames, threshold)
+    return figure
+
+
+def plot_precision_recall(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Draw precision over recall, a curve for each method.
+
+    Args:
+        curves: Name -> (precision, recall), arrays of equal length, by threshold.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(5.6, 5.2, None)
+        axes = figure.subplots()
+        for number, (name, (precision, recall)) in enumerate(curves.items()):
+            colour, dash = CURVES[number % len(CURVES)], ("-", "--", ":")[number // len(CURVES) % 3]
+            axes.plot(recall, precision, dash, color=colour, lw=1.8, label=name, clip_on=False)
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="recall", ylabel="precision", aspect="equal")
+        write_title(axes, "Recognised places", counted(len(curves), "method"))
+        longest = max(map(len, curves), default=1)
+        legend_below(axes, columns=max(1, min(3, len(curves), 66 // longest)))
+    return figure
+
+
+def contact_sheet(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
+    """Draw equally sized pictures in rows, each under its title.
+
+    Args:
+        images: ``uint8``, all ``(h, w)`` grey or all ``(h, w, 3)`` RGB, of one size.
+        titles: One for each picture.
+
+    Raises:
+        ValueError: If there are no pictures, or sizes or numbers differ.
+    """
+    shapes = {np.shape(image) for image in images}
+    if len(shapes) != 1 or len(images) != len(titles):
+        raise ValueError(
+            f"contact_sheet: got {len(images)} images of shapes {sorted(shapes)} and "
+            f"{len(titles)} titles; expected one shape, and a title for each"
+        )
+    stack = np.stack([as_rgb(image) for image in images])
+    n, height, width, _ = stack.shape
+    columns = min(n, max(1, round(math.sqrt(n * 1.4 * (1.25 * height) / width))))
+    rows = -(-n // columns)
+    pad = max(2, round(0.22 * max(height, 0.35 * width)))  # room for a title above each picture
+    tensor = torch.from_numpy(stack).permute(0, 3, 1, 2)
+    sheet = vision.make_grid(tensor, nrow=columns, padding=pad, pad_value=255)
+    sheet = sheet[:, : rows * (height + pad) + 2, pad - 2 : columns * (width + pad) + 2]
+    with mpl.rc_context(STYLE):
+        scale = 10.0 / (columns * (width + pad))
+        figure = new_figure(10.0, max(1.0, scale * rows * (height + pad) + 0.1), None)
+        axes = figure.subplots()
+        axes.imshow(sheet.permute(1, 2, 0).numpy(), interpolation="nearest")
+        axes.set_axis_off()
+        for number, text in enumerate(titles):
+            row, column = divmod(number, columns)
+            x, y = 1.5 + column * (width + pad), pad - 0.5 + row * (height + pad)
+            axes.text(x, y - 0.1 * pad, text, fontsize=8, va="bottom")
+    return figure
+
+
+def plot_summary(
+    poses: np.ndarray,
+    links: np.ndarray,
+    frames: Mapping[str, np.ndarray],
+    *,
+    activity: np.ndarray | None = None,
+    estimate: PoseEstimate | None = None,
+    image: np.ndarray | None = None,
+    template: np.ndarray | None = None,
+    threshold: float | None = None,
+    odometry_xy: np.ndarray | None = None,
+    track_xy: np.ndarray | None = None,
+    truth_xy: np.ndarray | None = None,
+    walls: np.ndarray | None = None,
+    current: Pose | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw a whole run on one sheet: odometry and map above; cells, last view and counts below.
+
+    Everything means what it means in :func:`plot_map`, :func:`plot_pose_cells`,
+    :func:`plot_frame_and_template` and :func:`plot_signals`; what is not given is left out.
+    ``frames`` needs the column ``template`` too, where there is an image.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(14.0, 10.0, title)
+        top, bottom = figure.subfigures(2, 1, height_ratios=[1.55, 1.0])
+        axes = top.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
+        if odometry_xy is not None:
+            draw_odometry(axes[0], np.asarray(odometry_xy))
+        draw_map(axes[-1], poses, links, track_xy, truth_xy, walls, current)
+        widths = [1.75 * (activity is not None), 0.8 * (image is not None), 1.55]
+        parts = bottom.subfigures(
+            1, sum(w > 0 for w in widths), width_ratios=[w for w in widths if w]
+        )
+        parts = list(np.atleast_1d(parts))
+        if activity is not None:
+            part = parts.pop(0)
+            draw_pose_cells(part, part.subplots(1, 2), np.asarray(activity), estimate, None)
+        if image is not None:
+            axes = parts.pop(0).subplots(1 if template is None else 2, 1, squeeze=False)[:, 0]
+            draw_frame(axes[0], image)
+            if template is not None:
+                error, name = float(frames["match_error"][-1]), int(frames["template"][-1])
+                draw_template(axes[1], template, error, name)
+        draw_signals(parts.pop(0), frames, threshold)
+    return figure

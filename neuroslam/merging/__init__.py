@@ -1,0 +1,1 @@
+"""Merging: whether two maps meet, and how two states become one."""

@@ -1,0 +1,221 @@
+"""Where do two finished maps meet? Every view of each is looked for in the other."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from neuroslam.spiking.landmark_matching import match_landmarks
+from neuroslam.merging.limits import elsewhere, far_off, tolerance
+from neuroslam.merging.merge import Match, differing
+from neuroslam.state.sessions import session_name
+from neuroslam.cells.wall_matching import match_walls
+from neuroslam.errors import counted
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.mapping.tables import Origins, origin_key
+from neuroslam.types import NO_TEMPLATE
+
+if TYPE_CHECKING:
+    from neuroslam.brain.brain import NavigationBrain
+
+
+class Found(NamedTuple):
+    """Where two maps meet, or why that cannot be told.
+
+    Attributes:
+        match: ``None`` if they do not, as far as can be seen.
+        reason: How it was found, or why not, for a reader.
+        groups: Numbers of pairs that agree with each other, the most first.
+    """
+
+    match: Match | None
+    reason: str
+    groups: tuple[int, ...] = ()
+
+
+def find_match(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found:
+    """Look for the places that two maps share.
+
+    Places that both have from a session they share are the same. Else each view of either map is
+    looked for in the other, and those are believed of which at least ``sessions.confirm`` agree on
+    how the maps lie: the largest such group, and the others that it leaves room for.
+
+    Args:
+        loaded: One brain; it is not altered.
+        partial: The other, whose config says how many must agree; it is not altered.
+    """
+    apart = differing(loaded, partial)
+    if apart:
+        return Found(
+            None, f"views or pose cells were made with different configs: {'; '.join(apart)}"
+        )
+    for name, brain in (("first", loaded), ("second", partial)):
+        if not brain.map.n:
+            return Found(None, f"the {name} map is empty")
+    shared = shared_history(loaded, partial)
+    if shared is not None:
+        return shared
+    if partial.config.has("place") and not partial.config.has("pose"):
+        return Found(*match_walls(loaded, partial))
+    if not partial.config.has("pose"):
+        return Found(*match_landmarks(loaded, partial))
+    pairs, best = _alike(loaded, partial)
+    threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
+    if not len(pairs.partial):
+        nearest = "" if best is None else f"; the most alike that was met differ by {best:.4f}"
+        return Found(
+            None, f"no view of one looks like a view of the other within {threshold:g}{nearest}"
+        )
+    limits = tolerance((loaded.map, partial.map), partial.config)
+    groups = [pairs.pick(g) for g in agreeing(pairs, partial.map.poses, loaded.map.poses, limits)]
+    sizes = tuple(n_places(group) for group in groups)
+    if sizes[0] < confirm:
+        return Found(
+            None,
+            f"{counted(len(np.unique(pairs.partial)), 'place looks', 'places look')} alike, but at "
+            f"most {sizes[0]} of them agree on how the maps lie, and {confirm} must (--confirm)",
+            sizes,
+        )
+    confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
+    first = confirmed[0]
+    at = int(np.argmin(first.error))
+    consistent = [g for g in confirmed[1:] if _fits(first, at, g, loaded.map, partial.map, limits)]
+    others = Pairs(*(np.concatenate(columns) for columns in zip(first, *consistent, strict=True)))
+    match = Match(
+        loaded=int(first.loaded[at]),
+        partial=int(first.partial[at]),
+        turn_rad=float(first.turn_rad[at]),
+        error=float(first.error[at]),
+        runner_up=_runner_up(loaded, partial, first, at, limits),
+        others=_once(others),
+    )
+    return Found(
+        match, f"{counted(len(match.pairs.partial), 'place is', 'places are')} the same", sizes
+    )
+
+
+def _alike(loaded: "NavigationBrain", partial: "NavigationBrain") -> tuple[Pairs, float | None]:
+    """Pairs of places whose views match, looked for both ways, and the smallest difference met."""
+    seen: dict[tuple[int, int], tuple[float, float]] = {}
+    best: float | None = None
+    threshold = partial.config.view.threshold
+    for queries, memory, sign in (
+        (partial.view, loaded.view, 1.0),
+        (loaded.view, partial.view, -1.0),
+    ):
+        for view in range(queries.n):
+            match = memory.search(queries.stored_view(view), threshold)
+            if match.template == NO_TEMPLATE:
+                continue
+            best = match.error if best is None else min(best, match.error)
+            if match.error > threshold:
+                continue
+            memory.last.template = match.template  # the next is likely to be beside it
+            key = (view, match.template) if sign > 0 else (match.template, view)
+            row = (sign * match.relative_heading_rad, match.error)
+            if key not in seen or row[1] < seen[key][1]:
+                seen[key] = row
+    at = [_places_of_views(brain) for brain in (partial, loaded)]
+    rows = [
+        (z, u, turn, error)
+        for (view_z, view_u), (turn, error) in seen.items()
+        for z in at[0].get(view_z, ())
+        for u in at[1].get(view_u, ())
+    ]
+    return Pairs.of(sorted(rows)), best
+
+
+def _places_of_views(brain: "NavigationBrain") -> dict[int, list[int]]:
+    places: dict[int, list[int]] = {}
+    for experience, view in enumerate(brain.map.experiences["template"].tolist()):
+        places.setdefault(view, []).append(experience)
+    return places
+
+
+def shared_history(loaded: "NavigationBrain", partial: "NavigationBrain") -> Found | None:
+    """Find the places that two maps have from one session; ``None`` if they share no session.
+
+    Args:
+        loaded: One brain; it is not altered.
+        partial: The other; it is not altered.
+    """
+    mine, theirs = loaded.map.origins(), partial.map.origins()
+    keys = [origin_key(o._asdict()) for o in (mine, theirs)]
+    _, i, j = np.intersect1d(*keys, return_indices=True)
+    if not len(i):
+        return None
+    one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
+    pixels = [_pixels(loaded, one.experience), _pixels(partial, other.experience)]
+    aliased = (np.isin(keys[0][i], origin_key(_aliases(loaded.map)))
+               | np.isin(keys[1][j], origin_key(_aliases(partial.map))))  # fmt: skip
+    differ = one.first_frame != other.first_frame
+    differ |= ~aliased & (pixels[0] != pixels[1]).any(axis=1)
+    if differ.any():
+        k = int(np.argmax(differ))
+        return Found(
+            None,
+            f"both hold session {session_name(int(one.session[k]))}, but its place "
+            f"{one.number[k]} is not the same in both: one of the maps was made from a copy that "
+            "went another way",
+        )
+    pairs = _once(
+        Pairs(
+            other.experience, one.experience, one.turn_rad - other.turn_rad, np.zeros(len(one[0]))
+        )
+    )
+    current = np.abs(pairs.partial - partial.map.current)
+    at = int(np.argmin(current))
+    match = Match(
+        int(pairs.loaded[at]), int(pairs.partial[at]), float(pairs.turn_rad[at]), others=pairs
+    )
+    return Found(
+        match,
+        f"{counted(len(pairs.partial), 'place is', 'places are')} of sessions that both maps hold",
+        (len(i),),
+    )
+
+
+def _pixels(brain: "NavigationBrain", places: np.ndarray) -> np.ndarray:
+    """Return the views of places, one row each; of what has none, a row that is equal to all."""
+    views = brain.map.experiences["template"].numpy()[places]
+    if not brain.view.n:
+        return np.zeros((len(places), 1))
+    return brain.view.templates["pixels"].numpy(force=True)[views].reshape(len(places), -1)
+
+
+def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:
+    return {name: of.aliases[name].numpy() for name in ("session", "number")}
+
+
+def _once(pairs: Pairs) -> Pairs:
+    """Each partial place once, as the most alike has it."""
+    order = np.lexsort((pairs.error, pairs.partial))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(pairs.partial[order]) != 0
+    return pairs.pick(order[first])
+
+
+def _fits(
+    first: Pairs,
+    at: int,
+    group: Pairs,
+    loaded: ExperienceMap,
+    partial: ExperienceMap,
+    limits: Tolerance,
+) -> bool:
+    """Could odometry be so wrong on the ways between two groups that both are right?"""
+    ends = [first.pick([at]), group.pick([int(np.argmin(group.error))])]
+    both = Pairs(*(np.concatenate(columns) for columns in zip(*ends, strict=True)))
+    misfit, allowed = far_off(both, loaded, partial, limits)
+    return bool(misfit[1] <= allowed[1])
+
+
+def _runner_up(
+    loaded: "NavigationBrain", partial: "NavigationBrain", pairs: Pairs, at: int, limits: Tolerance
+) -> float | None:
+    """Smallest difference of the matched view to any view of places elsewhere."""
+    templates = loaded.map.experiences["template"].numpy()
+    far = elsewhere(loaded.map, int(pairs.loaded[at]), limits)
+    rest = np.setdiff1d(templates, templates[~far])
+    view = int(partial.map.experiences["template"][pairs.partial[at]])
+    return min(loaded.view.differences(partial.view.stored_view(view), rest), default=None)

@@ -1,0 +1,1 @@
+"""What the command line does with whole runs: make, resume, look into, merge, compare them."""

@@ -1,0 +1,143 @@
+"""The demonstration: a drive through an embedded world, in two sessions that become one map."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from neuroslam.brain import load_brain
+from neuroslam.config import BrainConfig
+from neuroslam.errors import RunError
+from neuroslam.figures.maps import plot_summary, save
+from neuroslam.figures.sessions import Stage, plot_stages
+from neuroslam.runs.files import (
+    odometry_track,
+    read_frames,
+    read_plan,
+    read_trace,
+    require_free,
+    trajectory,
+)
+from neuroslam.runs.run import RunSummary, run
+from neuroslam.sensors import open_source
+from neuroslam.types import StepResult
+
+WORLD = "world:corridor?laps=2&noise=0.05&light=0.3&people=4"
+FIRST_STOP, SECOND_START = 240, 290
+"""Frames: of a lap of 340 the first session sees the first part, the second begins beyond it."""
+
+
+def demo(
+    out: str | Path,
+    on_step: Callable[[StepResult], None] | None = None,
+    on_start: Callable[[int | None], None] | None = None,
+) -> list[tuple[str, str]]:
+    """Map a corridor in two sessions, the second from a place unknown to it, and draw the map.
+
+    Args:
+        out: Folder for the runs ``first`` and ``second``, ``summary.png`` and ``sessions.png``; an
+            earlier demo there is replaced.
+        on_step: Called after each frame.
+        on_start: Called before each session, with the frame at which it ends.
+
+    Returns:
+        What was measured, as names and figures to print.
+
+    Raises:
+        RunError: If the folder holds another run, or cannot be written.
+        KeyboardInterrupt: If a session was; its run is saved.
+    """
+    out = Path(out)
+    for folder in (out, out / "first", out / "second"):
+        if (folder / "frames.csv").exists() and read_plan(folder).source != WORLD:
+            raise RunError(f"{folder}: holds a run of something else; take another folder")
+    require_free(out, WORLD, overwrite=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    parts: list[RunSummary] = []
+    for name, start, stop, maps in (
+        ("first", 0, FIRST_STOP, ()),
+        ("second", SECOND_START, None, (out / "first",)),
+    ):
+        parts.append(
+            run(
+                WORLD, out / name, BrainConfig(), maps=maps, start=start, stop=stop,
+                overwrite=True, on_step=on_step, on_start=on_start,
+            )
+        )  # fmt: skip
+        if parts[-1].interrupted:  # half a session would be told as if it were whole
+            raise KeyboardInterrupt
+    draw_summary(out / "second", out / "summary.png")
+    _draw_sessions(out, parts[1])
+    first, second = (part.to_dict() for part in parts)
+    rows = [
+        ("frames, first session and second", f"{first['frames']}, {second['frames']}"),
+        ("frames/s", f"{second['frames_per_s']:.0f}"),
+        ("places of the first session", f"{first['experiences']}"),
+    ]
+    for report in parts[1].merges:
+        places = report["counts"]["experiences"]
+        rows.append((f"recognised at frame {report['at_frame']}, places before",
+                     f"{places['loaded']} + {places['partial']}"))  # fmt: skip
+        rows.append(("places after the merge", f"{places['merged']}"))
+    return [
+        *rows,
+        ("places in the end", f"{second['experiences']}"),
+        ("loop closures", f"{second['loop_closures']}"),
+        ("error of odometry alone (ATE)", f"{second['odometry_ate_rmse_m']:.2f} m"),
+        ("error of the map (ATE)", f"{second['ate_rmse_m']:.2f} m"),
+    ]
+
+
+def _draw_sessions(out: Path, summary: RunSummary) -> None:
+    """Draw the map of the first session beside that of both."""
+    brains = [load_brain(out / name / "brain.safetensors") for name in ("first", "second")]
+    sessions = [brain.sessions.now.id for brain in brains]
+    matched = [report["match"]["loaded_experience"] for report in summary.merges]
+    panels = []
+    for title, brain, points in (
+        ("after the first session", brains[0], []),
+        ("after the second, joined", brains[1], matched),
+    ):
+        links, table = brain.map.links, brain.map.experiences
+        panels.append(
+            Stage(
+                title,
+                brain.map.poses,
+                np.column_stack([links.source, links.target]),
+                np.array([sessions.index(one) for one in table["session"].tolist()]),
+                brain.map.poses[points, :2],
+            )
+        )
+    save(plot_stages(panels, "Two sessions, one map"), out / "sessions.png")
+
+
+def draw_summary(out: str | Path, path: Path) -> None:
+    """Draw a run on one sheet: odometry, map, cells, last view, counts over time."""
+    out = Path(out)
+    brain, trace, frames = load_brain(out / "brain.safetensors"), read_trace(out), read_frames(out)
+    source = open_source(read_plan(out).source)
+    last = next(iter(source.frames(int(frames["frame"][-1]))))
+    links, cells = brain.map.links, brain.pose_cells
+    truth = np.column_stack([trace["truth_x_m"], trace["truth_y_m"]])
+    track = trajectory(brain, trace)[:, :2]
+    on = np.isfinite(track[:, 0])
+    seen = int(frames["template"][-1])
+    figure = plot_summary(
+        brain.map.poses,
+        np.column_stack([links.source, links.target]),
+        frames,
+        activity=cells.activity.numpy(),
+        estimate=cells.estimate,
+        image=last.image,
+        template=brain.view.template_image(seen) if seen >= 0 else None,
+        threshold=brain.config.view.threshold,
+        odometry_xy=odometry_track(brain.config, trace)[:, :2],
+        track_xy=track[on],
+        truth_xy=truth[on] if np.isfinite(truth).all() else None,
+        current=brain.map.pose,
+        title=f"{source.name}: {len(trace['time_s'])} frames",
+    )
+    save(figure, path)

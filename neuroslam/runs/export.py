@@ -1,0 +1,155 @@
+"""A map for other programs: tracks, pose-graph solvers, graph tools, neuromorphic simulators."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.state.sessions import session_name
+from neuroslam.errors import ConfigError, RunError
+from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
+from neuroslam.runs.files import brain_file, track_file
+from neuroslam.spiking.export import export_nir
+from neuroslam.state.tables import write_atomically
+
+
+def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
+    r"""Write a map in another program's format.
+
+    - ``tum``: of a run's folder its ``trajectory.tum``, a pose a frame; of a brain file the poses
+      of its experiences in order of their ids. Their time is no time but the number of the frame
+      that made them; where the frames of another session begin again from a lower number, they
+      are counted on, for times must rise.
+    - ``g2o``: a ``VERTEX_SE2`` for each experience, an ``EDGE_SE2`` for each link with its
+      measurement :math:`(d \cos h,\; d \sin h,\; f)` of distance, heading and facing, and the
+      information matrix :math:`\mathrm{diag}(\sigma_m^{-2}, \sigma_m^{-2}, \sigma_{rad}^{-2})`
+      of the config; vertex 0 is fixed.
+    - ``graphml``: a node for each experience with its pose, its view and its origin, a directed
+      edge for each link with all that it measured.
+    - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
+      (:func:`neuroslam.spiking.export.export_nir`, extra ``spiking-export``).
+
+    Args:
+        path: Brain file, or folder of a run.
+        to: File to write, whole or not at all; it is replaced if it is there.
+        kind: ``tum``, ``g2o``, ``graphml`` or ``nir``; the suffix of ``to`` if not given.
+
+    Returns:
+        ``to``.
+
+    Raises:
+        CheckpointError: If the brain cannot be read.
+        SourceError: If a run's trajectory cannot be read.
+        RunError: If the kind is unknown, the map is empty or ``to`` cannot be written.
+        ConfigError: If ``nir`` is asked for and not installed, or the brain has no such neurons.
+    """
+    path, to = Path(path), Path(to)
+    asked = kind or to.suffix.removeprefix(".").lower()
+    if asked not in _WRITERS:
+        raise RunError(
+            f"{to}: no such kind of export, {asked!r}; expected tum, g2o, graphml or nir"
+        )
+    source = brain_file(path)
+    if to.resolve() == source.resolve():
+        raise RunError(f"{to}: is the brain itself; take another file")
+    if asked == "tum" and path.is_dir():
+        track = track_file(path)
+        read_tum(track)  # a damaged one is no export
+
+        def write() -> None:
+            text = track.read_bytes()
+            write_atomically(to, lambda file: file.write_bytes(text))
+    else:
+        brain = load_brain(source)
+        if not brain.map.n and asked != "nir":
+            raise RunError(f"{path}: its map is empty, there is nothing to export")
+        write = partial(_WRITERS[asked], brain, to)
+    try:
+        write()
+    except OSError as error:
+        raise RunError(f"{to}: cannot be written ({error.strerror or error})") from None
+    return to
+
+
+def _write_tum(brain: NavigationBrain, to: Path) -> None:
+    frames = brain.map.experiences["first_frame"].numpy()
+    steps = np.diff(frames)
+    steps[steps <= 0] = 1
+    times = frames[0] + np.concatenate([[0], np.cumsum(steps)])
+    write_tum(to, Track(times.astype(np.float64), brain.map.poses))
+
+
+def _write_g2o(brain: NavigationBrain, to: Path) -> None:
+    links, config = brain.map.links, brain.config.map
+    vertices = np.column_stack([np.arange(brain.map.n), brain.map.poses]).tolist()
+    lines = [f"VERTEX_SE2 {int(i)} {x!r} {y!r} {theta!r}" for i, x, y, theta in vertices]
+    lines.append("FIX 0")
+    place, turn = config.sigma_m**-2, config.sigma_rad**-2
+    dx, dy = (
+        links.distance_m * np.cos(links.heading_rad),
+        links.distance_m * np.sin(links.heading_rad),
+    )
+    columns = (links.source, links.target, dx, dy, links.facing_rad)
+    lines += [
+        f"EDGE_SE2 {i} {j} {x!r} {y!r} {facing!r} {place!r} 0 0 {place!r} 0 {turn!r}"
+        for i, j, x, y, facing in zip(*(c.tolist() for c in columns), strict=True)
+    ]
+    text = "\n".join(lines) + "\n"
+    write_atomically(to, lambda file: file.write_text(text, encoding="ascii"))
+
+
+def _write_graphml(brain: NavigationBrain, to: Path) -> None:
+    table, links = brain.map.experiences, brain.map.links
+    x, y, theta = brain.map.poses.T.tolist()
+    nodes = {
+        "x_m": x,
+        "y_m": y,
+        "theta_rad": theta,
+        "template": table["template"].tolist(),
+        "session": [session_name(session) for session in table["session"].tolist()],
+        "number": table["number"].tolist(),
+        "first_frame": table["first_frame"].tolist(),
+    }
+    names = ("distance_m", "heading_rad", "facing_rad", "duration_s")
+    edges = {name: getattr(links, name).tolist() for name in names}
+    root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
+    types = {int: "long", float: "double", str: "string"}
+    for what, columns in (("node", nodes), ("edge", edges)):
+        for name, values in columns.items():
+            kind = types[type(values[0])] if values else "double"
+            of = {"id": name, "for": what, "attr.name": name, "attr.type": kind}
+            ElementTree.SubElement(root, "key", of)
+    graph = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
+    for i in range(brain.map.n):
+        _add_data(ElementTree.SubElement(graph, "node", id=f"n{i}"), nodes, i)
+    for i, (source, target) in enumerate(zip(links.source, links.target, strict=True)):
+        ends = {"id": f"e{i}", "source": f"n{source}", "target": f"n{target}"}
+        _add_data(ElementTree.SubElement(graph, "edge", ends), edges, i)
+    ElementTree.indent(root)
+    tree = ElementTree.ElementTree(root)
+    write_atomically(to, lambda file: tree.write(file, encoding="utf-8", xml_declaration=True))
+
+
+def _write_nir(brain: NavigationBrain, to: Path) -> None:
+    if not brain.config.has("semantic") or brain.config.semantic.tier != "spiking":
+        raise ConfigError(
+            f"{to}: the brain has no spiking neurons; run it with semantic cells and "
+            "--set semantic.tier=spiking"
+        )
+    export_nir(brain.semantic.slam.integrator, to)
+
+
+def _add_data(element: ElementTree.Element, columns: dict[str, list], row: int) -> None:
+    for name, values in columns.items():
+        ElementTree.SubElement(element, "data", key=name).text = str(values[row])
+
+
+_WRITERS: dict[str, Callable[[NavigationBrain, Path], None]] = {
+    "tum": _write_tum,
+    "g2o": _write_g2o,
+    "graphml": _write_graphml,
+    "nir": _write_nir,
+}

@@ -1,0 +1,356 @@
+"""A fleet of robots: each maps a session of its own, then the maps are merged, as a tree."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.config import BrainConfig
+from neuroslam.errors import MapError, NeuroslamError, RunError
+from neuroslam.evaluation.trajectory import absolute_trajectory_error
+from neuroslam.figures.maps import save
+from neuroslam.figures.sessions import Stage, plot_stages
+from neuroslam.figures.style import SESSIONS, plain_text, shortened
+from neuroslam.runs.files import (
+    OnBadFrame,
+    RunPlan,
+    brain_file,
+    read_trace,
+    require_free,
+    trajectory,
+    true_poses,
+    write_text,
+)
+from neuroslam.runs.merge import merge_runs
+from neuroslam.runs.parallel import outcomes
+from neuroslam.runs.sweep import claim, run_one, told
+from neuroslam.sensors.open import absolute_spec
+
+REPORT = "fleet.json"
+MERGED = "merged"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A map of one session or of several that were merged.
+
+    Attributes:
+        folder: Its run, relative to the fleet's folder.
+        sessions: Numbers of its sessions, from 1, in order.
+    """
+
+    folder: str
+    sessions: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return "+".join(map(str, self.sessions))
+
+
+@dataclass
+class FleetReport:
+    """What became of a fleet: the content of ``fleet.json``.
+
+    Attributes:
+        sessions: A row for each source: figures of its run, or ``error``; and ``ate_merged_m``, its
+            error on the merged map, where the truth is known.
+        tree: Each merge that was tried: level, round, the parts, and either folder or reason.
+        merged: The largest map: its folder, sessions and figures; empty if nothing was merged.
+        apart: Maps that are not in it: folder, sessions, and why not.
+    """
+
+    sessions: list[dict[str, Any]] = field(default_factory=list)
+    tree: list[dict[str, Any]] = field(default_factory=list)
+    merged: dict[str, Any] = field(default_factory=dict)
+    apart: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def failed(self) -> list[dict[str, Any]]:
+        """Sessions that went wrong."""
+        return [row for row in self.sessions if row["error"]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class _Session:
+    # What a process is asked to do: everything in it can be sent to another machine.
+    source: str
+    folder: Path
+    config: BrainConfig
+    preset: str
+    on_bad_frame: OnBadFrame
+
+
+@dataclass(frozen=True)
+class _Pair:
+    first: Path
+    second: Path
+    out: Path
+
+
+def fleet(
+    sources: Sequence[str | Path],
+    out: str | Path,
+    config: BrainConfig | None = None,
+    *,
+    preset: str = "",
+    on_bad_frame: OnBadFrame = "stop",
+    jobs: int | None = None,
+    ray: str | None = None,
+    overwrite: bool = False,
+    on_done: Callable[[str, int, int], None] | None = None,
+) -> FleetReport:
+    """Map each source on its own, then merge the maps pairwise until one is left, or none meet.
+
+    On each level of the tree neighbours are paired first. Where two maps do not meet, each is tried
+    with the nearest other map of the level that is free; who finds none waits for the next level.
+    The order of all this depends on what merges, never on what is ready first.
+
+    Args:
+        sources: As for :func:`neuroslam.runs.run.run`: a session each.
+        out: Folder to write: ``sessions/``, ``merges/``, ``merged/`` like :func:`merge_runs` writes
+            it, ``fleet.json`` and ``fleet.png``. With Ray, on a disk that all machines share.
+        config: Of all brains; the defaults if not given.
+        preset: Name of the preset that the config is from, to be remembered.
+        on_bad_frame: As for :func:`neuroslam.runs.run.run`.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`.
+        ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
+        overwrite: Replace an earlier fleet in ``out``.
+        on_done: Called after each run and merge: what it was, how many are done, and of how many.
+
+    Returns:
+        The tree, all merge reports, what stayed apart and why. A session that fails does not stop
+        the others.
+
+    Raises:
+        RunError: If there are fewer than two sources, or ``out`` holds a fleet already or cannot be
+            written, or Ray is not to be reached.
+    """
+    out = Path(out).resolve()
+    if len(sources) < 2:
+        raise RunError(f"a fleet has 2 sources or more, got {len(sources)}")
+    claim(out, REPORT, overwrite)
+    digits = len(str(len(sources)))
+    orders = [
+        _Session(
+            absolute_spec(str(source)), out / "sessions" / f"{number:0{digits}d}",
+            config or BrainConfig(), preset, on_bad_frame,
+        )
+        for number, source in enumerate(sources, start=1)
+    ]  # fmt: skip
+    for order in orders:
+        require_free(order.folder, order.source, overwrite)
+    if not overwrite and any((out / name).exists() for name in ("merges", MERGED)):
+        raise RunError(f"{out}: holds merges of a fleet; take another folder or --overwrite")
+    for name in ("merges", MERGED):  # of an earlier fleet: none would fit the new sessions
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / REPORT).unlink(missing_ok=True)
+    report = FleetReport()
+    found = _all(_map, orders, jobs, ray, "sessions", on_done)
+    for number, (order, outcome) in enumerate(zip(orders, found, strict=True), start=1):
+        row = {"session": number, "source": str(sources[number - 1])}
+        folder = str(order.folder.relative_to(out))
+        report.sessions.append(row | {"folder": folder} | told(outcome, order.folder))
+    parts = [Part(row["folder"], (row["session"],)) for row in report.sessions if not row["error"]]
+    parts = _merge_all(parts, out, report, jobs, ray, on_done)
+    try:
+        _conclude(parts, out, report)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    return report
+
+
+def _map(order: _Session) -> dict[str, Any]:
+    given = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    return run_one(order.source, order.folder, order.config, **given)
+
+
+def _merge(pair: _Pair) -> list[dict[str, Any]]:
+    """Merge two; the last report says that it was done, or why not."""
+    _, reports = merge_runs(pair.first, pair.second, pair.out, overwrite=True)
+    return [report.to_dict() for report in reports]
+
+
+def _all(
+    function: Callable,
+    orders: Sequence[Any],
+    jobs: int | None,
+    ray: str | None,
+    what: str,
+    on_done: Callable[[str, int, int], None] | None,
+) -> list[Any]:
+    found: dict[int, Any] = {}
+    with closing(outcomes(function, orders, jobs, ray)) as each:
+        for number, outcome in each:
+            found[number] = outcome
+            if on_done is not None:
+                on_done(what, len(found), len(orders))
+    return [found[number] for number in range(len(orders))]
+
+
+def _merge_all(
+    parts: list[Part],
+    out: Path,
+    report: FleetReport,
+    jobs: int | None,
+    ray: str | None,
+    on_done: Callable[[str, int, int], None] | None,
+) -> list[Part]:
+    """Merge until one map is left, or all pairs of those that are left were refused."""
+    tried: set[tuple[Part, Part]] = set()
+    level, before = 0, 0
+    while len(parts) > 1 and len(parts) != before:
+        level, before, turn, made = level + 1, len(parts), 0, 0
+        free, merged = list(parts), []
+        while pairs := list(_pairs(free, tried)):
+            turn += 1
+            orders = [
+                _Pair(out / a.folder, out / b.folder, out / "merges" / f"{level}-{made + k}")
+                for k, (a, b) in enumerate(pairs, start=1)
+            ]
+            made += len(pairs)
+            found = _all(_merge, orders, jobs, ray, f"merges, level {level}", on_done)
+            for pair, order, outcome in zip(pairs, orders, found, strict=True):
+                row: dict[str, Any] = {
+                    "level": level, "round": turn,
+                    "first": list(pair[0].sessions), "second": list(pair[1].sessions),
+                }  # fmt: skip
+                if isinstance(outcome, NeuroslamError):
+                    row |= {"merged": False, "reason": str(outcome), "reports": []}
+                else:
+                    row |= {"merged": outcome[0]["merged"], "reason": outcome[0]["reason"]}
+                    row["reports"] = outcome
+                tried.add(pair)
+                if row["merged"]:
+                    row["folder"] = str(order.out.relative_to(out))
+                    both = tuple(sorted(pair[0].sessions + pair[1].sessions))
+                    merged.append(Part(row["folder"], both))
+                    free = [part for part in free if part not in pair]
+                report.tree.append(row)
+        parts = sorted([*merged, *free], key=lambda part: part.sessions)
+    return parts
+
+
+def _pairs(free: Sequence[Part], tried: set[tuple[Part, Part]]) -> Iterator[tuple[Part, Part]]:
+    """Pair the parts that were not tried with each other, neighbours first, each once."""
+    left = dict.fromkeys(range(len(free)))
+    for apart in range(1, len(free)):
+        for k in range(len(free) - apart):
+            pair = (free[k], free[k + apart])
+            if k in left and k + apart in left and pair not in tried:
+                del left[k], left[k + apart]
+                yield pair
+
+
+def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
+    """Copy the largest map to its place, measure it, say what stayed apart, and draw."""
+    most = max(parts, key=lambda part: len(part.sessions), default=None)
+    stages, made = [], set()
+    if most is not None and len(most.sessions) > 1:
+        _copy(out / most.folder, out / MERGED)
+        brain = load_brain(out / MERGED / "brain.safetensors")
+        report.merged = {
+            "folder": MERGED,
+            "made_in": most.folder,
+            "sessions": list(most.sessions),
+            "templates": brain.view.n,
+            "experiences": brain.map.n,
+            "links": brain.map.n_links,
+        }
+        _measure(brain, most, out, report)
+    for part in parts:
+        if part is not most or not report.merged:
+            reasons = [
+                f"with {'+'.join(map(str, other))}: {row['reason']}"
+                for row in report.tree
+                for own, other in (("first", "second"), ("second", "first"))
+                if not row["merged"] and row[own] == list(part.sessions)
+                for other in (row[other],)
+            ]
+            report.apart.append(
+                {"sessions": list(part.sessions), "folder": part.folder, "reasons": reasons}
+            )
+        stage, makers = _stage(part, out, report)
+        stages.append((part is most, stage))
+        made |= makers
+    text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False) + "\n"
+    if stages:
+        stages.sort(key=lambda stage: not stage[0])
+        title = f"A fleet of {len(report.sessions)}"
+        if report.merged:
+            title += f": {len(most.sessions)} sessions on one map"
+        title += f", {len(report.apart)} apart" if report.apart else ""
+        title += f", {len(report.failed)} failed" if report.failed else ""
+        if len(report.sessions) > len(SESSIONS):
+            title += f"; colours repeat after {len(SESSIONS)} sessions"
+        figure = plot_stages([stage for _, stage in stages], title, _names(report, made))
+        save(figure, out / "fleet.png")
+    write_text(out / REPORT, text)
+
+
+def _names(report: FleetReport, made: set[int]) -> list[str]:
+    """Name each session by its source; and say which made none of the places drawn, and why."""
+    names = []
+    for row in report.sessions:
+        name = plain_text(f"{row['session']}: {shortened(RunPlan(row['source']).name)}")
+        without = "failed" if row["error"] else "no place of its own"
+        names.append(name if row["session"] in made else f"{name}, {without}")
+    return names
+
+
+def _copy(source: Path, to: Path) -> None:
+    """Copy a folder, whole or not at all."""
+    with tempfile.TemporaryDirectory(prefix=f".{to.name}.", dir=to.parent) as name:
+        shutil.copytree(source, Path(name) / to.name)
+        (Path(name) / to.name).replace(to)
+
+
+def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport) -> None:
+    """Lay the tracks of all sessions on one map over the truth: each, and together."""
+    tracks, truths = [], []
+    for number in part.sessions:
+        trace = read_trace(out / report.sessions[number - 1]["folder"])
+        truth = true_poses(trace)
+        if truth is None:
+            return
+        track = trajectory(brain, trace)
+        on = np.isfinite(track[:, 0])
+        tracks.append(track[on, :2])
+        truths.append(truth[on, :2])
+    try:
+        both = np.concatenate(tracks), np.concatenate(truths)
+        report.merged["ate_rmse_m"] = absolute_trajectory_error(*both, "rigid").rmse
+        for number, track, truth in zip(part.sessions, tracks, truths, strict=True):
+            alone = absolute_trajectory_error(track, truth, "rigid")
+            report.sessions[number - 1]["ate_merged_m"] = alone.rmse
+    except MapError:  # robots that have not moved: nothing tells how to lay a track over the truth
+        return
+
+
+def _stage(part: Part, out: Path, report: FleetReport) -> tuple[Stage, set[int]]:
+    """Return a map as it is drawn, and the sessions that made its places."""
+    brain = load_brain(brain_file(out / part.folder))
+    ids = {  # a robot that is carried, or whose recording has a gap, has several
+        session.id: row["session"]
+        for row in report.sessions
+        if row["session"] in part.sessions
+        for session in load_brain(brain_file(out / row["folder"])).sessions.sessions
+    }
+    links = brain.map.links
+    makers = [ids[one] for one in brain.map.experiences["session"].tolist()]
+    stage = Stage(
+        f"{'session' if len(part.sessions) == 1 else 'sessions'} {part}",
+        brain.map.poses,
+        np.column_stack([links.source, links.target]),
+        (np.array(makers, dtype=np.int64) - 1) % len(SESSIONS),
+    )
+    return stage, set(makers)

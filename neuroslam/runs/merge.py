@@ -1,0 +1,171 @@
+"""Merging two finished sessions, as runs or brain files, into a folder like that of a run."""
+
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.errors import RunError
+from neuroslam.merging.match import find_match
+from neuroslam.merging.merge import MergeReport, merge
+from neuroslam.runs.files import (
+    FRAME_COLUMNS,
+    LANDMARKS_FILE,
+    RUN_FILES,
+    RunPlan,
+    brain_file,
+    read_plan,
+    require_free,
+)
+from neuroslam.runs.parallel import one_thread
+from neuroslam.runs.run import RunSummary, write_results
+
+_REST_LOOPS = 5000
+"""Most loops in which the merged map is relaxed; a large map goes on relaxing when it is used."""
+
+
+_ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
+"""The files of a run that have a row a frame, and what they are without any."""
+
+
+def join_brains(
+    loaded: NavigationBrain, partial: NavigationBrain
+) -> tuple[NavigationBrain | None, list[MergeReport]]:
+    """Find where two finished maps meet and merge them; then the maps that either had stored.
+
+    Args:
+        loaded: The brain that is merged into; it is not altered.
+        partial: The brain whose session can go on afterwards; it is not altered.
+
+    Returns:
+        The merged brain, or ``None`` where it is refused; and a report of each merge, the first
+        being that of the two.
+    """
+    found = find_match(loaded, partial)
+    if found.match is None:
+        return None, [_refusal(found.reason, loaded, partial)]
+    merged, report = merge(loaded, partial, found.match)
+    report.found = found.reason
+    reports = [report]
+    if merged is None:
+        return None, reports
+    merged.sessions.merges[-1] = report.to_dict()
+    left = list(merged.stored)
+    while left:
+        more = _join_one(merged, left)
+        if more is None:
+            break
+        merged, report = more
+        left = list(merged.stored)
+        reports.append(report)
+    merged.map.state.at_rest = 0
+    merged.map.relax(max(20, min(_REST_LOOPS, 5_000_000 // max(1, merged.map.n_links))))
+    return merged, reports
+
+
+def _join_one(
+    brain: NavigationBrain, stored: list[NavigationBrain]
+) -> tuple[NavigationBrain, MergeReport] | None:
+    for i, other in enumerate(stored):
+        found = find_match(other, brain)
+        if found.match is None:
+            continue
+        alone = NavigationBrain(brain.config)
+        alone.take(brain.state_dict(), stored[:i] + stored[i + 1 :])
+        merged, report = merge(other, alone, found.match)
+        if merged is not None:
+            return merged, report
+    return None
+
+
+def _refusal(reason: str, loaded: NavigationBrain, partial: NavigationBrain) -> MergeReport:
+    return MergeReport(
+        merged=False,
+        reason=reason,
+        loaded_sessions=[session.name for session in loaded.sessions.sessions],
+        partial_sessions=[session.name for session in partial.sessions.sessions],
+        counts={
+            "views": {"loaded": loaded.view.n, "partial": partial.view.n},
+            "experiences": {"loaded": loaded.map.n, "partial": partial.map.n},
+            "links": {"loaded": loaded.map.n_links, "partial": partial.map.n_links},
+        },
+    )
+
+
+def merge_runs(
+    first: str | Path,
+    second: str | Path,
+    out: str | Path,
+    *,
+    confirm: int | None = None,
+    overwrite: bool = False,
+) -> tuple[RunSummary | None, list[MergeReport]]:
+    """Merge two finished sessions and write the files of a run; nothing if it is refused.
+
+    The folder is that of the second session, on the merged map: its frames, and ``resume`` goes on
+    with it. If that is only a brain file, there are no frames to write.
+
+    Args:
+        first: Run folder or brain file that is merged into: its ids stay.
+        second: Run folder or brain file of the session that can go on.
+        out: Folder to write; made if missing.
+        confirm: Places that must agree; the second one's config says if not given.
+        overwrite: Replace the files of an earlier run in ``out``.
+
+    Returns:
+        What ``metrics.json`` holds, or ``None`` where it is refused; and the reports.
+
+    Raises:
+        CheckpointError: If a brain cannot be loaded.
+        RunError: If ``out`` is one of the two or holds a run already, or cannot be written.
+    """
+    out, files = Path(out), [brain_file(path) for path in (first, second)]
+    brains = [load_brain(file) for file in files]
+    for file in files:
+        require_free(out, str(file.resolve()), overwrite)
+        if file.resolve().parent == out.resolve():
+            raise RunError(f"{out}: holds one of the two maps; take another folder")
+    for name in _ROWS:
+        if Path(second).is_dir() and not (Path(second) / name).is_file():
+            raise RunError(f"{Path(second) / name}: missing; give its brain file to merge without")
+    loaded, partial = brains
+    if confirm is not None:
+        sessions = partial.config.sessions.model_copy(update={"confirm": confirm})
+        partial.config = partial.config.model_copy(update={"sessions": sessions})
+    with one_thread(partial.config.threads), torch.inference_mode():
+        merged, reports = join_brains(loaded, partial)
+        if merged is None:
+            return None, reports
+        plan = replace(_plan_of(second), maps=(str(files[0].resolve()),))
+        return _write(merged, plan, Path(second), out), reports
+
+
+def _plan_of(second: str | Path) -> RunPlan:
+    path = Path(second)
+    return read_plan(path) if path.is_dir() else RunPlan(str(path.resolve()))
+
+
+def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> RunSummary:
+    """Write all files beside the folder first: a run that is there stays whole until they are."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as name:
+            beside = Path(name)
+            for file, empty in _ROWS.items():
+                if second.is_dir():
+                    shutil.copyfile(second / file, beside / file)
+                else:
+                    (beside / file).write_text(empty)
+            summary = write_results(brain, plan, beside, RunSummary())
+            out.mkdir(exist_ok=True)
+            for file in ("brain.safetensors", *RUN_FILES, LANDMARKS_FILE):
+                if (beside / file).exists():
+                    (beside / file).replace(out / file)
+                else:  # of an earlier run: it would not fit the new map
+                    (out / file).unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    return summary

@@ -1,0 +1,275 @@
+"""Watching a run from outside: TensorBoard, or nothing; the brain itself never asks."""
+
+import math
+import time
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import cv2
+import numpy as np
+import torch
+
+from neuroslam.errors import RunError
+from neuroslam.figures.maps import plot_map, render
+from neuroslam.runs.panels import CellPanels
+from neuroslam.runs.semantic_panels import SemanticPanels, known_landmarks
+from neuroslam.types import Frame, StepResult
+
+if TYPE_CHECKING:
+    from neuroslam.brain.brain import NavigationBrain
+    from neuroslam.spiking.semantic import SemanticCells
+
+_WIDTH = 320  # pixels of a recorded picture: a 60x10 template is too small to see
+_THUMBNAIL = 48  # pixels of a template's side in the projector, whose sprite must stay small
+
+
+class Recorder(ABC):
+    """Is told of every frame after the brain has taken it in. Usable in a ``with`` statement."""
+
+    @abstractmethod
+    def step(self, result: StepResult, frame: Frame, brain: "NavigationBrain") -> None:
+        """Take note of one frame."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what is still to be written; a second call does nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+
+class NullRecorder(Recorder):
+    """Records nothing."""
+
+    def step(self, result: StepResult, frame: Frame, brain: "NavigationBrain") -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class TensorBoardRecorder(Recorder):
+    """Writes event files that TensorBoard shows while the robot still runs.
+
+    Scalars: ``view/match_error``, ``view/templates``, ``cells/peak`` (largest activity),
+    ``map/experiences``, ``map/links``, ``map/largest_correction`` (relaxation residual, m or rad)
+    and ``run/frames_per_s``. Images: ``view/frame_and_template``, ``cells/activity`` (x-y, and
+    x-heading) and ``map/experiences_and_links``. When it closes, the templates go to the projector.
+
+    A brain with place cells has besides: how many there are, boundary cells that were activated,
+    walls, boundary activity, doubt about the place, ``gridness/...`` of each module; and the
+    images ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, ever
+    rarer as they cost ever more.
+
+    A brain with a semantic map has besides: landmarks, how long they contradict, and of the last
+    step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate`` and ``ssp/lost``; rates of its
+    populations, where they are neurons; and as rarely as those the images ``ssp/map``, what the
+    map recalls for the landmarks seen most often, and ``ssp/spikes``.
+
+    Args:
+        folder: Where the event files go; made if missing.
+        scalars_every: Frames between two points of a curve.
+        images_every: Frames between two pictures of view and cells.
+        maps_every: Frames between two drawings of the map, by far the slowest (0.1 s).
+        projected: So many templates at most, evenly picked, go to the projector.
+
+    Raises:
+        RunError: If the folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        scalars_every: int = 10,
+        images_every: int = 200,
+        maps_every: int = 1000,
+        projected: int = 2000,
+    ) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # slow to import, for some not needed
+
+        self.scalars_every = scalars_every
+        self.images_every = images_every
+        self.maps_every = maps_every
+        self.projected = projected
+        self._last: tuple[int, NavigationBrain] | None = None
+        self._drawn = -1
+        self._clock = (time.perf_counter(), 0)
+        self._seen = 0
+        self._cells: CellPanels | None = None
+        self._semantic: tuple[SemanticCells, SemanticPanels] | None = None
+        self._cells_due = 0  # frame
+        try:
+            self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
+        except OSError as error:
+            raise RunError(f"events folder {folder}: cannot be written ({error})") from None
+
+    def step(self, result: StepResult, frame: Frame, brain: "NavigationBrain") -> None:
+        """Write what is due at this frame."""
+        self._last = (result.frame, brain)
+        self._seen += 1
+        if brain.config.has("place"):
+            self._cells = self._cells or CellPanels()
+            self._cells.note(brain)
+        if brain.config.has("semantic"):
+            self._watch(brain.semantic)
+        if result.frame % self.scalars_every == 0:
+            self._write_scalars(result, brain)
+        if result.frame % self.images_every == 0:
+            if frame.image is not None:
+                known = 0 <= result.view.template < brain.view.n
+                template = brain.view.template_image(result.view.template) if known else None
+                picture = frame_beside_template(frame.image, template)
+                self._write_picture("view/frame_and_template", picture, result.frame)
+            if brain.config.has("pose"):
+                picture = activity_picture(brain.pose_cells.activity.numpy(force=True))
+                self._write_picture("cells/activity", picture, result.frame)
+        if result.frame % self.maps_every == 0 and result.frame > 0:
+            self._write_map(result.frame, brain)
+
+    def close(self) -> None:
+        """Draw the last map, hand the templates to the projector, and close the files."""
+        if self._last is not None:
+            frame, brain = self._last
+            self._last = None
+            if self._drawn != frame:
+                self._write_map(frame, brain, last=True)
+            if brain.view.n:
+                self._write_projector(frame, brain)
+        if self._semantic is not None:
+            self._semantic[0].watch = None
+            self._semantic = None
+        self._writer.close()
+
+    def _watch(self, cells: "SemanticCells") -> None:
+        """Be told of the steps of SSP-SLAM; a brain that joins or starts a map has new cells."""
+        if self._semantic is not None:
+            if self._semantic[0] is cells:
+                return
+            self._semantic[0].watch = None
+        panels = SemanticPanels(cells.slam, self._writer)
+        self._semantic = cells, panels
+        cells.watch = panels.note
+
+    def _write_scalars(self, result: StepResult, brain: "NavigationBrain") -> None:
+        now, (then, seen) = time.perf_counter(), self._clock
+        self._clock = (now, self._seen)
+        values = {
+            "view/templates": result.n_templates,
+            "map/experiences": result.n_experiences,
+            "map/links": result.n_links,
+            "map/largest_correction": brain.map.largest_correction,
+            "run/frames_per_s": (self._seen - seen) / max(now - then, 1e-9),
+        }
+        if result.view.error >= 0:
+            values["view/match_error"] = result.view.error
+        if brain.config.has("pose"):
+            values["cells/peak"] = brain.pose_cells.peak
+        if self._cells is not None:
+            values |= self._cells.scalars(brain)
+        if brain.config.has("semantic"):
+            values["semantic/landmarks"] = brain.semantic.n
+            values["semantic/contradicted_s"] = float(brain.semantic.slam.contradicted_s[0])
+        if self._semantic is not None:
+            self._semantic[1].write_scalars(result.frame)
+        for tag, value in values.items():
+            self._writer.add_scalar(tag, value, result.frame)
+
+    def _write_map(self, frame: int, brain: "NavigationBrain", last: bool = False) -> None:
+        links = brain.map.links
+        figure = plot_map(
+            brain.map.poses,
+            np.column_stack([links.source, links.target]),
+            current=brain.map.pose,
+            landmarks=brain.landmarks_m,
+        )
+        self._write_picture("map/experiences_and_links", render(figure), frame)
+        if last or frame >= self._cells_due:
+            self._cells_due = frame + max(self.maps_every, frame // 2)
+            self._write_cells(frame, brain)
+        self._drawn = frame
+
+    def _write_cells(self, frame: int, brain: "NavigationBrain") -> None:
+        if self._cells is not None:
+            figures, scores = self._cells.draw(brain)
+            for tag, drawn in figures.items():
+                self._write_picture(tag, render(drawn), frame)
+            for tag, score in scores.items():
+                self._writer.add_scalar(tag, score, frame)
+        if self._semantic is not None:
+            cells, panels = self._semantic
+            panels.write_pictures(frame, known_landmarks(cells))
+
+    def _write_picture(self, tag: str, picture: np.ndarray, frame: int) -> None:
+        self._writer.add_image(tag, picture, frame, dataformats="HWC")
+
+    def _write_projector(self, frame: int, brain: "NavigationBrain") -> None:
+        n = brain.view.n
+        ids = np.unique(np.linspace(0, n - 1, min(n, self.projected)).round().astype(int))
+        images = [brain.view.template_image(int(i)) for i in ids]
+        size = (_THUMBNAIL, _THUMBNAIL)  # the projector draws square sprites
+        thumbnails = np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images])
+        self._writer.add_embedding(
+            np.stack(images).reshape(len(ids), -1),
+            metadata=[f"template {i}" for i in ids],
+            label_img=torch.from_numpy(thumbnails)[:, None].expand(-1, 3, -1, -1) / 255.0,
+            global_step=frame,
+            tag="templates",
+        )
+
+
+def frame_beside_template(image: np.ndarray, template: np.ndarray | None) -> np.ndarray:
+    """Put a frame above its template, both 320 pixels wide.
+
+    Args:
+        image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+        template: ``uint8``, ``(h, w)``; ``None`` leaves the frame alone.
+
+    Returns:
+        ``uint8``, ``(h, 320, 3)``.
+
+    Example:
+        >>> frame_beside_template(np.zeros((12, 16), np.uint8), np.zeros((1, 6), np.uint8)).shape
+        (301, 320, 3)
+    """
+    rows = [_widened(image)]
+    if template is not None:
+        rows += [np.full((8, _WIDTH, 3), 255, np.uint8), _widened(template)]
+    return np.concatenate(rows)
+
+
+def activity_picture(activity: np.ndarray) -> np.ndarray:
+    """Colour the activity of pose cells: left x and y, right x and heading.
+
+    Every cell is a block of at least 200 / n pixels; y and heading point up, dark is silent,
+    yellow the peak.
+
+    Args:
+        activity: ``(n_theta, n_y, n_x)``.
+
+    Returns:
+        ``uint8``, ``(h, w, 3)``, h and each half at least 200.
+
+    Example:
+        >>> activity_picture(np.ones((36, 21, 21), np.float32)).shape
+        (210, 428, 3)
+    """
+    above, side = activity.sum(axis=0), activity.sum(axis=1)
+    block = math.ceil(200 / min(above.shape))
+    height, width = above.shape[0] * block, above.shape[1] * block
+    halves = []
+    for layer in (above, side):
+        grey = (255.0 * layer / (layer.max() or 1.0)).round().astype(np.uint8)
+        large = cv2.resize(grey[::-1], (width, height), interpolation=cv2.INTER_NEAREST)
+        halves.append(cv2.applyColorMap(large, cv2.COLORMAP_VIRIDIS)[..., ::-1])
+    return np.concatenate([halves[0], np.full((height, 8, 3), 255, np.uint8), halves[1]], axis=1)
+
+
+def _widened(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    how = cv2.INTER_AREA if width > _WIDTH else cv2.INTER_NEAREST
+    large = cv2.resize(image, (_WIDTH, max(1, round(height * _WIDTH / width))), interpolation=how)
+    return np.repeat(large[..., None], 3, axis=2) if large.ndim == 2 else large

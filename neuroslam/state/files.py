@@ -1,0 +1,109 @@
+"""Files that say whether they are whole: safetensors with a config and a checksum. No pickle."""
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, uint8
+
+from neuroslam.errors import CheckpointError
+from neuroslam.state.tables import write_atomically
+
+_KEY = "neuroslam"  # one metadata key: safetensors does not keep the order of several
+
+
+def tensors_digest(tensors: dict[str, Tensor]) -> str:
+    """Return the SHA-256 over names, dtypes, shapes and bytes of tensors, in order of name."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous().cpu()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
+        digest.update(tensor.reshape(-1).view(uint8).numpy() if tensor.numel() else b"")
+    return digest.hexdigest()
+
+
+def save_checked(path: str | Path, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Write tensors and what is known about them to one file.
+
+    The file is written beside ``path``, flushed to the disk and then renamed: whatever happens,
+    ``path`` is the old file or the new one.
+
+    Args:
+        path: Usually ends in ``.safetensors``.
+        about: ``format``, a number, and whatever belongs to the kind of file.
+        tensors: The state; it is not changed.
+    """
+    tensors = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    text = json.dumps(about | {"sha256": tensors_digest(tensors)}, sort_keys=True)
+    write_atomically(Path(path), lambda file: save_file(tensors, file, metadata={_KEY: text}))
+
+
+def load_checked(
+    path: str | Path, kind: str, newest: int
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read and check a file: what is known about it, and its tensors.
+
+    Args:
+        path: The file.
+        kind: What it should be, ``"brain"`` or another.
+        newest: Highest format that can be read.
+
+    Raises:
+        CheckpointError: In one line, what is wrong: missing, not such a file, a pickle, truncated,
+            of a newer format, or altered since it was written.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such {kind} file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        _say_if_a_pickle(path, kind)
+        raise CheckpointError(
+            f"{path}: damaged, not readable as safetensors ({first_line(error)}); "
+            "restore it from a copy"
+        ) from None
+    try:
+        about: dict[str, Any] = json.loads(metadata[_KEY])
+        version, digest = int(about["format"]), str(about["sha256"])
+    except (KeyError, ValueError, TypeError):
+        raise CheckpointError(
+            f"{path}: a safetensors file, but not one that neuroslam wrote"
+        ) from None
+    if about.get("kind", "brain") != kind:
+        raise CheckpointError(f"{path}: a {about.get('kind', 'brain')} file, not a {kind} file")
+    if version > newest:
+        raise CheckpointError(
+            f"{path}: format {version}, this neuroslam reads up to {newest}; upgrade it"
+        )
+    if tensors_digest(tensors) != digest:
+        raise CheckpointError(
+            f"{path}: its content does not match its SHA-256, it was altered or damaged; "
+            "restore it from a copy"
+        )
+    return about, tensors
+
+
+def first_line(error: Exception) -> str:
+    """Return the line of a long error that says what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[1] if len(lines) > 1 and lines[0].endswith(":") else (lines or ["?"])[0]
+
+
+def _say_if_a_pickle(path: Path, kind: str) -> None:
+    with path.open("rb") as file:
+        head = file.read(8)
+    if head[:2] == b"PK" or head[:1] == b"\x80":
+        raise CheckpointError(
+            f"{path}: a pickle (as torch.save writes), which can run code when read; "
+            "neuroslam reads only its own safetensors files"
+        )
+    size = path.stat().st_size
+    if len(head) < 8 or struct.unpack("<Q", head)[0] > size - 8:
+        raise CheckpointError(f"{path}: truncated ({size} bytes) or not a {kind} file")

@@ -1,0 +1,1 @@
+"""Worlds that are made: rendered ones, arenas with walks in them, landmarks to be seen."""

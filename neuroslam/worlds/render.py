@@ -1,0 +1,372 @@
+"""Draws a world as a camera sees it: one ray per column, whole rows and columns at once."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from neuroslam.geometry import TWO_PI
+from neuroslam.types import Pose
+from neuroslam.worlds.atlas import LEVELS_GROUND, LEVELS_U, LEVELS_V, Atlas
+from neuroslam.worlds.scene import Billboard, Surface, World
+
+_NEVER = 1e6  # depth (m) of a ray that hits nothing
+_NEAR_M = 0.15  # figures nearer than this are inside the camera
+_FINE = 2  # rows drawn per row delivered: slanted edges become smooth
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A level camera. Forward is the middle column; the left half of the picture is to the left.
+
+    A point at ``depth`` along a column's ray and ``z`` above the camera is seen ``focal_px * z /
+    depth`` pixels above the horizon. Pinhole: depth is along the axis, columns are equally wide on
+    a plane. Panoramic: depth is the distance, columns are equal angles through the full turn.
+
+    Attributes:
+        width: Columns.
+        height: Rows.
+        fov_deg: Horizontal field of view; ignored if panoramic.
+        panoramic: Sees the full turn on a cylinder.
+        camera_height_m: Height above the floor.
+        horizon: Row of the horizon as a share of the height, from the top.
+
+    Example:
+        >>> Camera(width=160, height=60, fov_deg=90.0).focal_px
+        80.0
+    """
+
+    width: int = 160
+    height: int = 64
+    fov_deg: float = 90.0
+    panoramic: bool = False
+    camera_height_m: float = 1.1
+    horizon: float = 0.5
+
+    @cached_property
+    def focal_px(self) -> float:
+        """Pixels per unit of slope."""
+        if self.panoramic:
+            return self.width / TWO_PI
+        return round(0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2.0), 9)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """Direction of each column, robot's axes (x forward, y left), ``(width, 2)``, depth 1."""
+        right = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_px
+        if self.panoramic:
+            return np.column_stack([np.cos(right), -np.sin(right)])
+        return np.column_stack([np.ones(self.width), -right])
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Slope of each fine row, up positive, ``float32 (_FINE * height,)``."""
+        rows = (np.arange(_FINE * self.height) + 0.5) / _FINE
+        return ((self.horizon * self.height - rows) / self.focal_px).astype(np.float32)
+
+
+class Hits(NamedTuple):
+    """What each column's ray meets, each of shape ``(width,)``.
+
+    ``depth`` in units of the ray; ``strip`` which picture; ``along_m`` where on it; ``slant`` the
+    sine of the angle between ray and surface times the ray's length; ``top_m`` height of the thing.
+    """
+
+    depth: np.ndarray
+    strip: np.ndarray
+    along_m: np.ndarray
+    slant: np.ndarray
+    top_m: np.ndarray
+
+
+def render(
+    world: World,
+    pose: Pose,
+    camera: Camera,
+    figures: Sequence[Billboard] = (),
+    gain: float = 1.0,
+) -> np.ndarray:
+    """Draw what a camera at ``pose`` sees.
+
+    Args:
+        world: The world.
+        pose: Where the camera is: metres, metres, radians.
+        camera: Its optics.
+        figures: Figures besides the world's own, such as passers-by at this moment.
+        gain: Factor on all grey levels, cut at white.
+
+    Returns:
+        ``uint8 (height, width, 3)``, RGB.
+    """
+    c, s = math.cos(pose.theta_rad), math.sin(pose.theta_rad)
+    rays = camera.rays @ np.array([[c, s], [-s, c]])
+    layers = cast(world, pose, rays, camera.camera_height_m)
+    length = np.hypot(rays[:, 0], rays[:, 1]).astype(np.float32)
+    slopes = camera.slopes[:, None]
+
+    shape = (len(slopes), camera.width)
+    columns, rows, clear = (np.empty(shape, dtype=np.float32) for _ in range(3))
+    sky_rows = int(np.count_nonzero(slopes > 0.0))
+    _draw_flat(world, world.ground, pose, rays, camera, slice(sky_rows, None), columns, rows)
+    clear[sky_rows:] = -camera.camera_height_m / slopes[sky_rows:] * length
+    if world.ceiling is not None:
+        _draw_flat(world, world.ceiling, pose, rays, camera, slice(0, sky_rows), columns, rows)
+        rise = world.ceiling.height_m - camera.camera_height_m
+        clear[:sky_rows] = rise / slopes[:sky_rows] * length
+    else:
+        _draw_sky(world.atlas, rays, slopes[:sky_rows], length, columns, rows)
+        clear[:sky_rows] = 0.0
+    for hits in layers:
+        _draw_upright(world.atlas, hits, camera, length, columns, rows, clear)
+    np.exp(clear * np.float32(-1.0 / world.sight_m), out=clear)
+
+    image = cv2.remap(world.atlas.image, columns, rows, cv2.INTER_LINEAR)
+    haze = np.empty_like(image)
+    haze[:] = world.haze
+    image = cv2.blendLinear(image, haze, clear, 1.0 - clear)
+    _draw_figures(image, world, pose, rays, camera, figures, layers)
+    image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return image if gain == 1.0 else cv2.convertScaleAbs(image, alpha=gain)
+
+
+def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]:
+    r"""Find what rays meet: the nearest wall or pillar, and the one that reaches highest.
+
+    A ray :math:`p + t d` meets the wall :math:`a + q e` where, with :math:`a` seen from :math:`p`,
+    :math:`t = (a \times e) / (d \times e)` and :math:`q = (a \times d) / (d \times e)`.
+
+    Args:
+        world: The world.
+        pose: Where the rays start; their directions are given, its heading is not used.
+        rays: Directions in the world's axes, shape ``(n, 2)``.
+        eye_m: Height of the rays above the floor.
+
+    Returns:
+        The nearest hits, as the last of the list; before them, where tops differ, those of the
+        highest elevation, which may be seen above the nearest.
+    """
+    at = np.array([pose.x_m, pose.y_m])
+    start = world.walls[:, :2] - at
+    edge = world.walls[:, 2:] - world.walls[:, :2]
+    across = start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]
+    seen = across < 0.0  # the rest show their backs
+    middle = rays[len(rays) // 2]
+    if np.all(rays @ middle > 0.0):  # no ray points backward: what is all behind is out of sight
+        ahead = np.maximum(start @ middle, (start + edge) @ middle)
+        seen &= ahead > 0.0
+    index = np.flatnonzero(seen) if seen.any() else np.zeros(1, dtype=int)
+    start, edge, across = start[index], edge[index], across[index]
+    x, y = rays[:, :1], rays[:, 1:]
+    below = np.minimum(x * edge[:, 1] - y * edge[:, 0], -1e-12)
+    share = start[:, 0] * y - start[:, 1] * x
+    meets = (share <= 1e-9) & (share >= below - 1e-9) & (across < 0.0)
+    depth = np.where(meets, across / below, _NEVER)
+    strip = world.wall_strips[index]
+    if len(world.pillars):
+        toward = rays @ (world.pillars[:, :2] - at).T
+        off = x * (world.pillars[:, 1] - at[1]) - y * (world.pillars[:, 0] - at[0])
+        square = x * x + y * y
+        inside = square * world.pillars[:, 2] ** 2 - off * off
+        root = np.sqrt(np.maximum(inside, 0.0))
+        reach = (toward - root) / square
+        reach = np.where((inside > 0.0) & (reach > 0.0), reach, _NEVER)
+        depth = np.hstack([depth, reach])
+        strip = np.concatenate([strip, world.pillar_strips])
+
+    column = np.arange(len(rays))
+    lengths = np.hypot(edge[:, 0], edge[:, 1])
+    top = world.strip_heights_m[strip]
+
+    def describe(which: np.ndarray) -> Hits:
+        t = depth[column, which]
+        wall = np.minimum(which, len(index) - 1)
+        along = share[column, wall] / below[column, wall] * lengths[wall]
+        along += world.wall_offsets_m[index[wall]]
+        slant = -below[column, wall] / lengths[wall]
+        if len(world.pillars):
+            pillar = which - len(index)
+            round_ = pillar >= 0
+            p = world.pillars[np.maximum(pillar, 0)]
+            hit = at + t[:, None] * rays - p[:, :2]
+            angle = np.arctan2(hit[:, 1], hit[:, 0]) + math.pi
+            along = np.where(round_, angle * p[:, 2], along)
+            slant = np.where(round_, root[column, np.maximum(pillar, 0)] / p[:, 2], slant)
+        return Hits(
+            t, strip[which], along, np.maximum(slant, 1e-3), np.where(t < _NEVER, top[which], 0.0)
+        )
+
+    near = describe(np.argmin(depth, axis=1))
+    if np.ptp(world.strip_heights_m) == 0.0:
+        return [near]
+    return [describe(np.argmax((top - eye_m) / depth, axis=1)), near]
+
+
+def measure_ranges(world: World, pose: Pose, n_beams: int, eye_m: float) -> np.ndarray:
+    """Return what a scanner measures: distances to walls and pillars, without noise.
+
+    Args:
+        world: The world.
+        pose: Of the scanner.
+        n_beams: Beams, evenly over the full turn, counter-clockwise from straight ahead.
+        eye_m: Its height above the floor.
+
+    Returns:
+        Metres, ``(n_beams,)``; ``inf`` where nothing is met.
+    """
+    angle = pose.theta_rad + 2.0 * math.pi * np.arange(n_beams) / n_beams
+    rays = np.column_stack([np.cos(angle), np.sin(angle)])
+    depth = cast(world, pose, rays, eye_m)[-1].depth
+    return np.where(depth < _NEVER, depth, np.inf)
+
+
+def _draw_upright(
+    atlas: Atlas,
+    hits: Hits,
+    camera: Camera,
+    length: np.ndarray,
+    columns: np.ndarray,
+    rows: np.ndarray,
+    clear: np.ndarray,
+) -> None:
+    """Enter, for every pixel of these walls, where in the atlas it is and how far away."""
+    per_m = atlas.strip_per_m[hits.strip]
+    per_column = per_m * hits.depth / (camera.focal_px * hits.slant)
+    per_row = per_m * hits.depth / (_FINE * camera.focal_px)
+    u = np.clip(np.log2(per_column) + 0.5, 0, LEVELS_U - 1).astype(int)
+    v = np.clip(np.log2(per_row) + 0.5, 0, LEVELS_V - 1).astype(int)
+    origin = atlas.strip_origin[hits.strip, u, v]
+    scale = atlas.strip_scale[hits.strip, u, v]
+    depth = hits.depth.astype(np.float32)
+    rise = (hits.top_m - camera.camera_height_m).astype(np.float32)
+
+    slopes = camera.slopes[:, None]
+    wall = (slopes <= rise / depth) & (slopes >= np.float32(-camera.camera_height_m) / depth)
+    column = origin[:, 0] + hits.along_m.astype(np.float32) * scale[:, 0] - np.float32(0.5)
+    row = (origin[:, 1] - np.float32(0.5) + rise * scale[:, 1]) - slopes * (depth * scale[:, 1])
+    np.copyto(columns, column, where=wall)
+    np.copyto(rows, row, where=wall)
+    np.copyto(clear, depth * length, where=wall)
+
+
+def _draw_flat(
+    world: World,
+    surface: Surface,
+    pose: Pose,
+    rays: np.ndarray,
+    camera: Camera,
+    part: slice,
+    columns: np.ndarray,
+    rows: np.ndarray,
+) -> None:
+    """Enter, for the rows of ``part``, where in the atlas their floor or ceiling is."""
+    tiles = world.atlas.ground if surface is world.ground else world.atlas.ceiling
+    slopes = camera.slopes[part].astype(float)
+    rise = surface.height_m - camera.camera_height_m
+    depth = rise / slopes
+    # A pixel's footprint: depth / f across, depth^2 / (rise f) along; their geometric mean.
+    footprint = depth / camera.focal_px * np.sqrt(np.abs(depth / rise) / _FINE)
+    level = np.clip(np.log2(footprint * surface.px_per_m), 0, LEVELS_GROUND - 1).astype(int)
+    left, top, scale_x, scale_y = tiles[level].T.astype(float)
+    scale_x, scale_y = scale_x * surface.px_per_m, scale_y * surface.px_per_m
+    y_top = surface.y_m + surface.image.shape[0] / surface.px_per_m
+    start = left - 0.5 + (pose.x_m - surface.x_m) * scale_x
+    columns[part] = np.multiply.outer(depth * scale_x, rays[:, 0]) + start[:, None]
+    start = top - 0.5 + (y_top - pose.y_m) * scale_y
+    rows[part] = start[:, None] - np.multiply.outer(depth * scale_y, rays[:, 1])
+
+
+def _draw_sky(
+    atlas: Atlas,
+    rays: np.ndarray,
+    slopes: np.ndarray,
+    length: np.ndarray,
+    columns: np.ndarray,
+    rows: np.ndarray,
+) -> None:
+    left, top, width, height = atlas.sky
+    turn = (math.pi - np.arctan2(rays[:, 1], rays[:, 0])) / TWO_PI
+    columns[: len(slopes)] = left - 0.5 + turn * width
+    up = np.minimum(slopes / length, 1.0)
+    rows[: len(slopes)] = (top + height - 1.0) - up * (height - 1.0)
+
+
+def _draw_figures(
+    image: np.ndarray,
+    world: World,
+    pose: Pose,
+    rays: np.ndarray,
+    camera: Camera,
+    figures: Sequence[Billboard],
+    layers: list[Hits],
+) -> None:
+    """Blend figures into the fine image, the farthest first, where no wall hides them."""
+    every = [*world.billboards, *figures]
+    if not every:
+        return
+    table = np.array(every)
+    dx, dy = table[:, 0] - pose.x_m, table[:, 1] - pose.y_m
+    distance = np.maximum(np.hypot(dx, dy), 1e-9)
+    dx, dy = dx / distance, dy / distance
+    # A figure faces the camera: its plane is square to the line of sight to its middle.
+    toward = rays[:, :1] * dx + rays[:, 1:] * dy
+    depth = distance / np.maximum(toward, 0.05)
+    aside = depth * (rays[:, :1] * dy - rays[:, 1:] * dx)
+    shown = (toward > 0.05) & (np.abs(aside) < 0.5 * table[:, 2])
+    shown &= (distance > _NEAR_M) & (distance < table[:, 3] * camera.focal_px)
+    top = (table[:, 3] - camera.camera_height_m) / depth
+    for hits in layers:
+        rise = (hits.top_m - camera.camera_height_m) / hits.depth
+        shown &= (depth < hits.depth[:, None]) | (top > rise[:, None])
+    for i in np.argsort(-distance, kind="stable").tolist():
+        columns = np.flatnonzero(shown[:, i])
+        if len(columns):
+            ahead, across = depth[columns, i], aside[columns, i]
+            _blend(image, world, camera, every[i], distance[i], columns, ahead, across, layers)
+
+
+def _blend(
+    image: np.ndarray,
+    world: World,
+    camera: Camera,
+    figure: Billboard,
+    distance: float,
+    columns: np.ndarray,
+    depth: np.ndarray,
+    aside: np.ndarray,
+    layers: list[Hits],
+) -> None:
+    """Blend one figure into the given columns of the fine image."""
+    eye = camera.camera_height_m
+    downward = -camera.slopes
+    nearest = depth.min()
+    first = int(np.searchsorted(downward, (eye - figure.height_m) / nearest))
+    last = int(np.searchsorted(downward, eye / nearest, side="right"))
+    slope = camera.slopes[first:last, None]
+
+    levels = world.figure_levels[figure.cutout]
+    per_row = levels[0].shape[0] / figure.height_m * distance / (_FINE * camera.focal_px)
+    picture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
+    h, w = picture.shape[:2]
+    v = (figure.height_m - eye - slope * depth) * (h / figure.height_m) - 0.5
+    v = v.astype(np.float32)
+    u = np.empty_like(v)
+    u[:] = (aside / figure.width_m + 0.5) * w - 0.5
+    patch = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    patch = patch.astype(np.float32)
+    for hits in layers:
+        wall = hits.depth[columns]
+        patch[(depth > wall) & (slope <= (hits.top_m[columns] - eye) / wall)] = 0.0
+
+    fade = math.exp(-distance / world.sight_m)
+    tint = np.zeros((3, 4))  # colours are already times opacity, the fourth channel
+    tint[:, :3] = np.eye(3) * fade
+    tint[:, 3] = np.array(world.haze) * ((1.0 - fade) / 255.0)
+    veil = np.zeros((3, 5))
+    veil[:, 3:] = -1.0 / 255.0, 1.0
+    under = image[first:last, columns] * cv2.transform(patch, veil)
+    under += cv2.transform(patch, tint)
+    image[first:last, columns] = (under + 0.5).astype(np.uint8)
