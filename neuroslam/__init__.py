@@ -23,7 +23,7 @@ _HOME = {
 __all__ = ["BrainConfig", "NavigationBrain", "load_brain", "open_source", "run", "save_brain"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> Any:  # noqa: ANN401
     """Import the public names when they are first used: ``neuroslam --help`` needs no torch."""
     if name in _HOME:
         return getattr(import_module(_HOME[name]), name)

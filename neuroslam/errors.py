@@ -11,8 +11,18 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
         >>> did_you_mean("treshold", ["threshold", "crop"]), did_you_mean("x", ["threshold"])
         ("; did you mean 'threshold'?", '')
     """
-    near = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(word, known)
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known name that is most like an unknown one, if any is like it at all.
+
+    Example:
+        >>> nearest("treshold", ["threshold", "crop"])
+        'threshold'
+    """
+    return next(iter(difflib.get_close_matches(word, list(known), n=1)), None)
 
 
 def counted(n: int, one: str, several: str = "") -> str:
@@ -39,7 +49,7 @@ class SourceError(NeuroslamError, ValueError):
     """A video, folder, log or world that cannot be read, or a frame in it that cannot be used."""
 
 
-class BadFrame(SourceError):
+class BadFrame(SourceError):  # noqa: N818 - a frame is bad, the source is not
     """One frame that cannot be used; the ones after it may be, if the policy is to skip."""
 
 

@@ -157,13 +157,34 @@ def test_the_programs_of_a_page_run_as_printed(name, inputs, tmp_path, monkeypat
         exec(compile(program, name, "exec"), {})
 
 
-def test_the_population_of_the_page_merges_as_it_says():
+@pytest.fixture(scope="module")
+def visits_class():
     page, made = (ROOT / "docs" / "own_population.md").read_text(), {}
     exec(compile(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], "page", "exec"), made)
-    loaded, partial = made["Visits"](), made["Visits"]()
-    for visits, seen in ((loaded, (0, 1, 1)), (partial, (0, 0, 1))):
+    return made["Visits"]
+
+
+@pytest.mark.parametrize(
+    ("loaded", "partial", "views", "merged"),
+    [
+        ((0, 1, 1), (0, 0, 1), [1, 2], [1, 4, 1]),  # its first view is the other's second
+        ((0, 1, 1), (), [], [1, 2]),
+        ((), (0, 0, 1), [0, 1], [2, 1]),
+        ((), (), [], []),
+        ((0,), (0,), [2, 0, 3], [1, 0, 1, 0]),  # maps with views that were not seen since
+        ((0, 1, 1), (), [0, 2], [1, 2, 0]),
+    ],
+)
+def test_the_population_of_the_page_merges_as_it_says(loaded, partial, views, merged, visits_class):
+    states = []
+    for seen in (loaded, partial):
+        visits = visits_class()
         for template in seen:
             visits(ViewMatch(template, 0.0, 0.0, False))
-    join = SimpleNamespace(views=np.array([1, 2]))  # its first view is the other's second
-    merged = made["Visits"].merged(loaded.state_dict(), partial.state_dict(), join)
-    assert merged["counts"].tolist() == [1, 4, 1]
+        states.append(visits.state_dict())
+    join = SimpleNamespace(views=np.array(views, dtype=np.int64))
+    state = visits_class.merged(*states, join)
+    assert state["views.count"].tolist() == merged
+    again = visits_class()
+    again.load_state_dict(state)  # what was saved or merged goes on
+    assert again(ViewMatch(0, 0.0, 0.0, False)) == sum(merged) + 1

@@ -1,10 +1,19 @@
 """The folders are the data flow: an import never points against it, and none goes in a circle."""
 
 import ast
+import importlib
+import inspect
+import pkgutil
+import textwrap
 from pathlib import Path
 
 import networkx as nx
 import pytest
+from torch import nn
+
+import neuroslam
+from neuroslam.cells import GridSheet
+from neuroslam.state.tables import Scalars
 
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
@@ -89,3 +98,46 @@ def test_torchvision_is_imported_through_one_door():
             text = path.read_text()
             assert "import torchvision" not in text, path
             assert "from torchvision" not in text, path
+
+
+def our_modules() -> list[type[nn.Module]]:
+    """Every class of the package that is an nn.Module."""
+    found = set()
+    for info in pkgutil.walk_packages(neuroslam.__path__, "neuroslam."):
+        for value in vars(importlib.import_module(info.name)).values():
+            if inspect.isclass(value) and issubclass(value, nn.Module):
+                found.add(value)
+    return sorted((c for c in found if c.__module__.startswith("neuroslam.")), key=str)
+
+
+MEANT_TO_BE_OVERRIDDEN = {"forward", "extra_repr"}
+
+
+def names_of(module: type[nn.Module]) -> set[str]:
+    """Names that a class defines: methods, annotated fields, what is assigned to self."""
+    names = {*vars(module), *vars(module).get("__annotations__", {})}
+    for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(module)))):
+        stored = isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+        if stored and isinstance(node.value, ast.Name) and node.value.id == "self":
+            names.add(node.attr)
+    return names
+
+
+@pytest.mark.parametrize("module", our_modules(), ids=lambda c: c.__name__)
+def test_no_module_hides_a_name_of_torch(module):
+    of_torch = {name for name in {*dir(nn.Module), *vars(nn.Module())} if not name.startswith("_")}
+    hidden = names_of(module) & of_torch - MEANT_TO_BE_OVERRIDDEN
+    assert not hidden
+
+
+@pytest.mark.parametrize("name", ["parameters", "half", "training"])
+def test_a_number_of_the_state_hides_no_name_of_torch(name):
+    with pytest.raises(ValueError, match=f"'{name}' is a name of nn.Module"):
+        Scalars(**{name: 1})
+
+
+def test_the_parameters_of_every_module_can_be_listed():
+    sheet = GridSheet(n_cells=2)
+    assert list(sheet.parameters()) == []
+    sheet.float().requires_grad_(False).zero_grad()
+    assert {"GridSheet", "NavigationBrain", "SSPSLAM"} <= {c.__name__ for c in our_modules()}

@@ -23,6 +23,12 @@ from neuroslam.merging.match import shared_history
 from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import Profiles, VisualOdometry
+from neuroslam.sensors.frames import (
+    check_instant,
+    check_picture,
+    checked_number,
+    checked_odometry,
+)
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, State
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
@@ -205,8 +211,10 @@ class NavigationBrain(nn.Module):
         try:
             dt_s = self._elapsed(frame)
             observed = dict.fromkeys(self._populations)
-            if self._has_compass and not math.isfinite(frame.heading_rad or 0.0):
-                raise BadFrame(f"heading {frame.heading_rad:g} rad; expected a finite number")
+            if self._has_compass and frame.heading_rad is not None:
+                checked_number(frame.heading_rad, "heading", "rad")
+            if frame.image is not None:
+                check_picture(frame.image)
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None
@@ -529,6 +537,7 @@ class NavigationBrain(nn.Module):
         return compose(Pose(*self.map.experiences["pose"][experience].tolist()), offset)
 
     def _elapsed(self, frame: Frame) -> float:
+        check_instant(frame)
         if not self.clock.frames_seen:
             return 1.0 / self.config.frame_rate_hz
         dt_s = frame.time_s - self.clock.time_s
@@ -553,10 +562,7 @@ class NavigationBrain(nn.Module):
     def _velocity(self, frame: Frame, dt_s: float) -> tuple[Velocity, Profiles | None]:
         use = self.config.odometry.use
         if use != "visual" and frame.velocity is not None:
-            if not all(map(math.isfinite, frame.velocity)):
-                v, w = frame.velocity
-                raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
-            return Velocity(*map(float, frame.velocity)), None
+            return checked_odometry(frame.velocity), None
         if use == "given" or frame.image is None:
             raise BadFrame(
                 "no odometry in the source"

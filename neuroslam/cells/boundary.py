@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
+from neuroslam.sensors.frames import checked_array
 from neuroslam.state.mergeable import BufferModule
 
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
@@ -181,6 +183,28 @@ def _nearest(distance_m: Tensor) -> Tensor:
     if distance_m.shape[-1] == 0:
         return distance_m.new_full(distance_m.shape[:-1], math.inf)
     return distance_m.amin(-1)
+
+
+def checked_walls(walls: object) -> np.ndarray:
+    """Return the walls of a frame, if a sensor can have measured them.
+
+    Args:
+        walls: Distance (m) and bearing (rad) of each, ``(n, 2)``.
+
+    Returns:
+        The same, ``float64``.
+
+    Raises:
+        BadFrame: If they have another shape or type, or :func:`check_walls` refuses them.
+
+    Example:
+        >>> checked_walls(["left"])  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: walls are an array of text of shape (1,); expected ...
+    """
+    array = checked_array(walls, "walls", (None, 2), "distance in m and bearing in rad of each")
+    check_walls(*torch.from_numpy(np.ascontiguousarray(array)).unbind(-1))
+    return array
 
 
 def check_walls(distance_m: Tensor, bearing_rad: Tensor) -> None:

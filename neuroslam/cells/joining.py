@@ -254,9 +254,7 @@ def _join_views(loaded: State, partial: State, join: Join, frames: Frames) -> St
     return {f"seen.{name}": torch.cat([loaded[f"seen.{name}"], row]) for name, row in rows.items()}
 
 
-def navigation_faults(
-    state: Mapping[str, np.ndarray], n_experiences: int | None
-) -> Iterator[str]:
+def navigation_faults(state: Mapping[str, np.ndarray], n_experiences: int | None) -> Iterator[str]:
     """Say what makes no sense in a state of navigation cells.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.cells.boundary import BoundaryCells, check_walls
+from neuroslam.cells.boundary import BoundaryCells, check_walls, checked_walls
 from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.joining import join_navigation, navigation_faults, view_frames
@@ -19,6 +19,7 @@ from neuroslam.cells.walls import WallMemory, check_motion
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
+from neuroslam.sensors.frames import checked_number
 from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
@@ -211,8 +212,7 @@ class NavigationCells(Population):
             BadFrame: If walls or ranges cannot be that.
         """
         if frame.walls is not None:
-            check_walls(*torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).unbind(-1))
-            return frame.walls
+            return checked_walls(frame.walls)
         if frame.ranges is not None:
             return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
         return None
@@ -238,16 +238,16 @@ class NavigationCells(Population):
             BadFrame: If a number cannot be; nothing has changed then.
         """
         now, compass = self.now, compass_rad is not None
+        if compass:
+            compass_rad = checked_number(compass_rad, "heading", "rad")
         heading = (
             wrap_angle(compass_rad + now.turned_rad)
             if compass
             else wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
         )
         felt = torch.empty((0, 2), dtype=torch.float64)
-        if walls is not None and len(walls):
-            felt = torch.from_numpy(np.array(walls, dtype=np.float64))
-            if felt.dim() != 2 or felt.shape[1] != 2:
-                raise BadFrame(f"walls have shape {tuple(felt.shape)}; expected (n, 2)")
+        if walls is not None:
+            felt = torch.from_numpy(checked_walls(walls).copy())
             felt = felt[felt[:, 0].argsort()]
         device = self.walls.errors.device
         numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)
@@ -378,7 +378,9 @@ class NavigationCells(Population):
         return 0.5 * self.walls.expected_variance_m2[0].trace().item()
 
     @without_gradients
-    def update_from_landmark(self, place_m: tuple[float, float], sigma_m: float, variance_m2: float) -> bool:
+    def update_from_landmark(
+        self, place_m: tuple[float, float], sigma_m: float, variance_m2: float
+    ) -> bool:
         r"""Be corrected by where a known landmark puts one animal.
 
         A landmark makes no one surer than who learnt it was: its error is taken to be the

@@ -317,9 +317,7 @@ class PoseCellNetwork(Population):
             return
         c = self.config
         dx, dy = correction.displacement(self.heading_rad)
-        self.nudge(
-            dx / c.cell_size_m, dy / c.cell_size_m, correction.turn_rad * c.n_theta / TWO_PI
-        )
+        self.nudge(dx / c.cell_size_m, dy / c.cell_size_m, correction.turn_rad * c.n_theta / TWO_PI)
 
     def belief(self, map_: LeadableMap) -> Belief:
         """Return the pose on the map: the cells repeat themselves on the torus."""
@@ -327,9 +325,7 @@ class PoseCellNetwork(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose at which it was learnt."""
-        return Decision(
-            *map_(now.motion, now.view, self.estimate, now.frame, carried=now.vetoed)
-        )
+        return Decision(*map_(now.motion, now.view, self.estimate, now.frame, carried=now.vetoed))
 
     @property
     def rates(self) -> np.ndarray:
@@ -339,6 +335,11 @@ class PoseCellNetwork(Population):
     def scalars(self) -> dict[str, float]:
         """Return the activity of the most active cell."""
         return {"cells/peak": self.peak}
+
+    def images(self) -> dict[str, tuple[np.ndarray, ...]]:
+        """Return the activity summed over heading, and over y: x-y, and x-heading."""
+        activity = self.activity.numpy(force=True)
+        return {"cells/activity": (activity.sum(axis=0), activity.sum(axis=1))}
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Move bindings and activity of the partial session on the torus, and join the bindings.
@@ -391,7 +392,8 @@ class PoseCellNetwork(Population):
             yield f"{cls.name}.origin: {tuple(origin)} is not on the torus of {torus}"
         if (window < 0).any():
             cell = tuple(np.argwhere(window < 0)[0].tolist())
-            yield f"{cls.name}.window: {int((window < 0).sum())} cells are negative, the first {cell}"
+            n = int((window < 0).sum())
+            yield f"{cls.name}.window: {n} cells are negative, the first {cell}"
         total = window.sum(dtype=np.float64).item()
         if abs(total - 1.0) > _SUM_TOLERANCE[window.dtype.name]:
             yield f"{cls.name}.window: adds up to {total:.6g}, expected 1"
@@ -399,7 +401,8 @@ class PoseCellNetwork(Population):
             at = state[f"bindings.{axis}"]
             rows = np.flatnonzero((at < 0) | (at > limit))
             if len(rows):
-                yield f"{cls.name}.bindings.{axis}: rows {listed(rows)} are not on the torus of {torus}"
+                name = f"{cls.name}.bindings.{axis}"
+                yield f"{name}: rows {listed(rows)} are not on the torus of {torus}"
 
     def _write_buffers(self) -> None:
         packet, slip = self._now.packet, self._now.slip

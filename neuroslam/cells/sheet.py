@@ -278,7 +278,7 @@ class GridSheet(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.parameters = p = parameters or SheetParameters()
+        self.sheet_parameters = p = parameters or SheetParameters()
         for holds, name, got, expected in (
             (0 < spacing_m < math.inf, "spacing_m", spacing_m, "a positive number"),
             (1 <= n_cells <= p.n_y * p.n_x, "n_cells", n_cells, f"1 to {p.n_y * p.n_x}"),
@@ -310,7 +310,7 @@ class GridSheet(nn.Module):
     def reset(self, generator: torch.Generator | None = None) -> None:
         """Return to the pattern it was made with, or let a new one settle from drawn noise."""
         if generator is not None:
-            self.start = settled(self.parameters, generator).to(self.start)
+            self.start = settled(self.sheet_parameters, generator).to(self.start)
         lead = () if self.batch is None else (self.batch,)
         self.sheet = self.start.expand(lead + self.start.shape).clone()
 
@@ -322,7 +322,8 @@ class GridSheet(nn.Module):
     @property
     def fastest_m_s(self) -> float:
         """Speed at which the drive reaches its limit; who is faster is followed too slowly."""
-        return self.parameters.drive_limit * self.spacing_m * min(calibrated_gains(self.parameters))
+        p = self.sheet_parameters
+        return p.drive_limit * self.spacing_m * min(calibrated_gains(p))
 
     def forward(self, velocity_m_s: Tensor, dt_s: float) -> Tensor:
         """Move by one step and return the rates, ``([batch,] n_cells)``.
@@ -334,7 +335,7 @@ class GridSheet(nn.Module):
         Raises:
             MapError: If the velocity has another shape or is not finite, or time runs backward.
         """
-        p = self.parameters
+        p = self.sheet_parameters
         velocity = checked_velocity(self, velocity_m_s, dt_s, self.batch).to(self.sheet)
         drive = velocity @ self.turn_and_gain
         speed = torch.linalg.vector_norm(drive, dim=-1, keepdim=True)

@@ -1,7 +1,5 @@
 """The config of a brain: which populations it is composed of, and every number in them."""
 
-from typing import Any
-
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
@@ -51,24 +49,24 @@ class BrainConfig(Section):
         "your own; as pose+place",
     )
     frame_rate_hz: float = Field(default=20.0, gt=0, description="where the source has no times")
-    threads: int = Field(
-        default=1, ge=1, description="of a run; for one brain, one is the fastest"
-    )
+    threads: int = Field(default=1, ge=1, description="of a run; for one brain, one is the fastest")
     max_gap_s: float = Field(
         default=2.0, gt=0, description="a longer gap between frames is an error"
     )
 
     @model_validator(mode="before")
     @classmethod
-    def _with_sections(cls, values: Any) -> Any:
+    def _with_sections(cls, values: object) -> object:
         """Check the sections of populations by the classes that those have."""
         if not isinstance(values, dict):
             return values
         checked, refused = dict(values), []
-        for key in values.keys() - cls.model_fields.keys():
+        for key in [key for key in values if key not in cls.model_fields]:
             section = section_class(key) if key in known_kinds() else None
             if section is None:
-                refused.append(InitErrorDetails(type="extra_forbidden", loc=(key,), input=values[key]))
+                refused.append(
+                    InitErrorDetails(type="extra_forbidden", loc=(key,), input=values[key])
+                )
             elif not isinstance(values[key], section):
                 try:
                     checked[key] = section.model_validate(values[key])
@@ -120,13 +118,9 @@ def _inside(section: str, error: ValidationError) -> ValidationError:
     """Name the section in the errors of its keys."""
     lines = [
         InitErrorDetails(
-            type=PydanticCustomError(line["type"], "{text}", {"text": line["msg"]}),
+            type=PydanticCustomError(line["type"], "{said}", {"said": line["msg"]}),
             loc=(section, *line["loc"]),
             input=line["input"],
-        )
-        if line["type"] not in ("extra_forbidden",)
-        else InitErrorDetails(
-            type=line["type"], loc=(section, *line["loc"]), input=line["input"]
         )
         for line in error.errors()
     ]

@@ -26,7 +26,7 @@ PLUGINS = "NEUROSLAM_PLUGINS"
 """Environment variable with the files of :func:`load_plugin`, for the processes of a sweep."""
 
 registered: dict[str, type[Any]] = {}
-"""Class of each kind whose module was imported; :func:`neuroslam.state.registry.register` fills it."""
+"""Class of each kind whose module was imported, as :mod:`neuroslam.state.registry` fills it."""
 
 _loaded: set[str] = set()
 

@@ -1,16 +1,115 @@
 """Sections of a brain's config: every parameter with its unit, its bounds and what it does."""
 
-from typing import Literal, Self
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from neuroslam.errors import did_you_mean, nearest
 
 Region = tuple[int, int, int, int]
 
+_SPACING_RATIO = 1.3  # of a grid module to the next smaller one
+_GOLDEN = 0.6180339887498949
+
 
 class Section(BaseModel):
-    """A group of parameters: frozen, unknown keys refused, no infinities."""
+    """A group of parameters: frozen, unknown keys refused, no infinities.
+
+    An unknown key or choice is told together with the known one that is most like it.
+
+    Example:
+        >>> PoseCellConfig(n_xz=20)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        pydantic_core._pydantic_core.ValidationError: 1 validation error for PoseCellConfig
+        n_xz
+          unknown key 'n_xz'; did you mean 'n_xy'? [type=unknown_key, ...]
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _say_what_was_meant(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(values)
+        except ValidationError as error:
+            told = error.errors(include_url=False)
+            if not {each["type"] for each in told} & {"extra_forbidden", *_WITH_HINTS}:
+                raise
+        # Unknown keys first: what else is wrong may follow from them.
+        told.sort(key=lambda each: each["type"] not in ("extra_forbidden", "unknown_key"))
+        lines = [_with_hint(cls, each) for each in told]
+        raise ValidationError.from_exception_data(cls.__name__, lines)
+
+
+_WITH_HINTS = ("unknown_key", "literal_error")
+
+
+def _with_hint(section: type[BaseModel], told: Mapping[str, Any]) -> InitErrorDetails:
+    """Complete an error of pydantic by what was meant, where it is of an unknown key or choice."""
+    kind, said, context = told["type"], told["msg"], told.get("ctx", {})
+    if kind in ("extra_forbidden", "unknown_key"):  # the latter of an inner section
+        key = ".".join(str(part) for part in told["loc"])
+        _, hinted, meant = said.partition("; did you mean ")
+        own = str(told["loc"][0]) in section.model_fields or len(told["loc"]) == 1
+        hint = _key_meant(section, key) if own else hinted + meant  # of a population's section
+        kind, said = "unknown_key", f"unknown key {key!r}{hint}"
+    elif kind == "literal_error" and "did you mean" not in said:
+        said += _choice_meant(told)
+    # The text as a value: it may hold braces, which a template may not.
+    error = PydanticCustomError(kind, "{said}", {**context, "said": said})
+    return InitErrorDetails(type=error, loc=told["loc"], input=told["input"])
+
+
+def _choice_meant(told: Mapping[str, Any]) -> str:
+    """End an error about an unknown choice with the one that is most like it, if any is."""
+    return did_you_mean(str(told["input"]), re.findall(r"'([^']*)'", told["ctx"]["expected"]))
+
+
+def all_keys(section: type[BaseModel], path: str = "") -> list[str]:
+    """Return the dotted keys of a section and of all sections within it.
+
+    Example:
+        >>> all_keys(SessionConfig)[:2]
+        ['confirm', 'drift']
+    """
+    keys = []
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        keys.append(f"{path}{name}")
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            keys += all_keys(inner, f"{path}{name}.")
+    return keys
+
+
+def _key_meant(section: type[BaseModel], key: str) -> str:
+    """Guess a key: one of that name in another section, else one like it in the same, or anywhere.
+
+    Args:
+        section: Within which all keys are.
+        key: Dotted, from that section on.
+    """
+    known = all_keys(section)
+    place, _, last = key.rpartition(".")
+    same = [each for each in known if each.rpartition(".")[2] == last]
+    if same:
+        return f"; did you mean {' or '.join(map(repr, same[:3]))}?"
+    beside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == place}
+    anywhere = {each.rpartition(".")[2]: each for each in reversed(known)}
+    for names in (beside, anywhere):
+        if (name := nearest(last, names)) is not None:
+            return f"; did you mean {names[name]!r}?"
+    return did_you_mean(key, known)
 
 
 class OdometryConfig(Section):
@@ -52,7 +151,12 @@ class ViewConfig(Section):
     threshold: float = Field(
         0.05, gt=0, lt=1, description="largest mean difference that is a match; larger: fewer views"
     )
-    shift_match: int = Field(4, ge=0, description="columns a forward view may be shifted by")
+    shift_match: int = Field(
+        4,
+        ge=0,
+        description="columns a forward view may be shifted by; of a template narrower than 9 px, "
+        "if it is not set, the most that leaves a column",
+    )
     shift_step: int = Field(1, ge=1, description="columns between two shifts that are tried")
     panoramic: bool = Field(False, description="roll through the full turn, report the heading")
     normalisation: float = Field(0.5, ge=0, le=1, description="mean grey to scale to; 0: off")
@@ -68,13 +172,23 @@ class ViewConfig(Section):
         "uint8", description="how a template is kept: one byte a pixel, or eight"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _shift_follows_the_width(cls, values: object) -> object:
+        if not isinstance(values, Mapping) or {"shift_match", "panoramic"} & values.keys():
+            return values
+        width, usual = values.get("template_width"), cls.model_fields["shift_match"].default
+        if not isinstance(width, int) or width > 2 * usual or width < 2:
+            return values
+        return {**values, "shift_match": (width - 1) // 2}
+
     @model_validator(mode="after")
     def _weights_are_of_a_named_network(self) -> Self:
         named = self.features not in ("grey", "module")
         if named and self.weights is None:
             raise ValueError(
                 f"features {self.features} needs weights: a file that holds the network's "
-                "state_dict"
+                f"state_dict{did_you_mean(self.features, ('grey', 'module'))}"
             )
         if self.weights is not None and not named:
             raise ValueError(f"weights are of a named network, and features is {self.features}")
@@ -211,10 +325,13 @@ class GridCellConfig(Section):
         (0.35, 0.46, 0.60, 0.78),
         min_length=1,
         description="distance of neighbouring fields, one for each module; ratios near 1.3 "
-        "keep places apart",
+        "keep places apart. If only orientations_deg is set: the first of these, further ones 1.3 "
+        "times the one before",
     )
     orientations_deg: tuple[float, ...] = Field(
-        (0.0, 15.0, -10.0, 7.0), description="of the grid axes, one for each module"
+        (0.0, 15.0, -10.0, 7.0),
+        description="of the grid axes, one for each module. If only spacings_m is set: the first "
+        "of these, and 37.08 k degrees of a further module k (the first is 0), within +-30",
     )
     directions: int = Field(
         6, ge=3, description="preferred directions of a module; other than 6: no hexagons"
@@ -231,16 +348,58 @@ class GridCellConfig(Section):
     learns_online: bool = Field(False, description="go on learning while moving")
     seed: int = Field(0, ge=0, description="of the random weights before development")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_list_follows_the_other(cls, values: object) -> object:
+        pair = ("spacings_m", "orientations_deg")
+        if not isinstance(values, Mapping) or len(values.keys() & set(pair)) != 1:
+            return values
+        given, other = sorted(pair, key=lambda name: name not in values)
+        if not isinstance(values[given], Sequence) or isinstance(values[given], str | bytes):
+            return values  # no list: what is wrong with it is told where it is checked
+        start = cls.model_fields[other].default
+        extend = _more_spacings if other == "spacings_m" else _more_orientations
+        n = max(1, len(values[given]))
+        return {**values, other: extend(start, n)[:n]}
+
     @model_validator(mode="after")
     def _modules_agree(self) -> Self:
         if len(self.spacings_m) != len(self.orientations_deg):
             raise ValueError(
                 f"spacings_m has {len(self.spacings_m)} modules, orientations_deg "
-                f"{len(self.orientations_deg)}; expected the same"
+                f"{len(self.orientations_deg)}; expected the same, or only one of the two"
             )
         if min(self.spacings_m) <= 0:
             raise ValueError(f"spacings_m has {min(self.spacings_m)}; expected more than 0")
         return self
+
+
+def _more_spacings(spacings_m: tuple[float, ...], n: int) -> tuple[float, ...]:
+    """Extend spacings by the ratio of modules, to the centimetre.
+
+    Example:
+        >>> _more_spacings((0.6, 0.78), 4)
+        (0.6, 0.78, 1.01, 1.31)
+    """
+    while len(spacings_m) < n:
+        spacings_m = (*spacings_m, round(_SPACING_RATIO * spacings_m[-1], 2))
+    return spacings_m
+
+
+def _more_orientations(orientations_deg: tuple[float, ...], n: int) -> tuple[float, ...]:
+    """Extend orientations so that no two of few are alike, in [-30, 30) degrees.
+
+    Hexagonal axes are the same again after 60 degrees; multiples of the golden section fill that
+    range evenly, however many they are.
+
+    Example:
+        >>> _more_orientations((0.0, 15.0, -10.0, 7.0), 6)
+        (0.0, 15.0, -10.0, 7.0, 28.3, 5.4)
+    """
+    further = range(len(orientations_deg), n)
+    return orientations_deg + tuple(
+        round((60.0 * _GOLDEN * k + 30.0) % 60.0 - 30.0, 1) for k in further
+    )
 
 
 class PlaceCellConfig(Section):

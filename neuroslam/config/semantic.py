@@ -1,6 +1,7 @@
 """Sections of the config of a semantic map: space, neurons, path integrator, map, loop closure."""
 
 import math
+from collections.abc import Mapping
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -14,7 +15,12 @@ class SSPSpaceConfig(Section):
     kind: Literal["hexagonal", "random", "rectangular"] = Field(
         "hexagonal", description="hexagonal: modules of grid cells, whose waves close"
     )
-    dimension: int = Field(2, ge=1, description="of the space that is mapped")
+    dimension: int = Field(
+        2,
+        ge=1,
+        description="of the space that is mapped; if it is not set, as many as length_scale_m or "
+        "reach_m has numbers",
+    )
     n_rotations: int = Field(3, ge=1, description="orientations of grid modules")
     n_scales: int = Field(3, ge=1, description="spacings of grid modules, for each orientation")
     n_random: int = Field(27, ge=1, description="frequencies of a random space")
@@ -28,6 +34,15 @@ class SSPSpaceConfig(Section):
         1.0, description="positions are decoded in [-reach, reach], in all directions or each"
     )
     seed: int = Field(0, ge=0, description="of random frequencies and rotations")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _dimension_follows(cls, values: object) -> object:
+        if not isinstance(values, Mapping) or "dimension" in values:
+            return values
+        each = (values.get(name) for name in ("length_scale_m", "reach_m"))
+        lengths = [len(value) for value in each if isinstance(value, tuple | list)]
+        return {**values, "dimension": max(lengths)} if max(lengths, default=1) > 1 else values
 
     @model_validator(mode="after")
     def _scales_rise(self) -> Self:

@@ -42,7 +42,7 @@ class Plan(NamedTuple):
     title: str
     source: str
     cuts: Callable[[Source], list[Cut]]
-    config: dict[str, Any] = {}
+    config: dict[str, Any] = {}  # noqa: RUF012
     paper_rmse: float = math.nan
     preset: str = ""
 

@@ -98,7 +98,9 @@ class Diary:
         if i % _LOOK_EVERY == 0 and len(beside):
             self._look(i, here, cells, beside)
 
-    def _look(self, i: int, here: NavigationEstimate, cells: NavigationCells, beside: np.ndarray) -> None:
+    def _look(
+        self, i: int, here: NavigationEstimate, cells: NavigationCells, beside: np.ndarray
+    ) -> None:
         grid = cells.grid.rates.flatten(-2)
         both = [cells.place.responses(grid, at).numpy() for at in (here.position_m, None)]
         for above, rates in zip(self.above, both, strict=True):

@@ -63,7 +63,7 @@ class Watched:
         self.signals: list[tuple[float, float, float]] = []
         self._fired: list[np.ndarray] = []
 
-    def __call__(self, step: int, said: Any) -> None:
+    def __call__(self, step: int, said: Any) -> None:  # noqa: ANN401 - a step of SSP-SLAM
         """Take a step."""
         fired = {name: array.spikes for name, array in populations(self.slam).items()}
         self._fired.append(fired["grid cells"][0, 0].numpy().astype(bool))

@@ -146,7 +146,8 @@ def plot_queries(
         figure = new_figure(3.5 * columns + 0.7, 3.55 * rows + 0.5, title)
         axes = figure.subplots(rows, columns, squeeze=False)
         draw_world(axes[0, 0], world, path_m)
-        write_title(axes[0, 0], "World", "grey: from where a landmark is seen")
+        seen_from = "grey: from where a landmark is seen" if world.view_radius_m > 0 else ""
+        write_title(axes[0, 0], "World", seen_from)
         for query, ax in zip(queries, axes.ravel()[1:], strict=False):
             draw_query(ax, world, query, most)
         for ax in axes.ravel()[n:]:

@@ -21,6 +21,7 @@ from neuroslam.figures.parts import (
     draw_template,
 )
 from neuroslam.figures.style import (
+    ACTIVITY,
     CURVES,
     STYLE,
     as_rgb,
@@ -100,6 +101,27 @@ def plot_pose_cells(
         figure = new_figure(9.0, 4.3, "Activity of the pose cells")
         axes = figure.subplots(1, 2)
         draw_pose_cells(figure, axes, np.asarray(activity), estimate, injection)
+    return figure
+
+
+def plot_activity(layers: np.ndarray | tuple[np.ndarray, ...], title: str) -> Figure:
+    """Draw the activity of a population: layers of cells side by side, or a picture as it is.
+
+    Args:
+        layers: ``(h, w)`` of any scale, or several of them; or ``uint8``, ``(h, w, 3)``.
+        title: Name of the population, or of what is seen.
+    """
+    layers = layers if isinstance(layers, tuple) else (layers,)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(4.6 * len(layers) + 0.4, 4.2, title)
+        for ax, layer in zip(
+            figure.subplots(1, len(layers), squeeze=False)[0], layers, strict=True
+        ):
+            shown = ax.imshow(layer, ACTIVITY, origin="lower", aspect="auto")
+            ax.set(xlabel="cell", ylabel="cell")
+            ax.grid(visible=False)
+            if layer.ndim == 2:
+                figure.colorbar(shown, ax=ax, label="activity (arbitrary unit)")
     return figure
 
 

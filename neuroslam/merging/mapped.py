@@ -22,11 +22,18 @@ class Mapped(Protocol):
     sessions: SessionLog
 
     @property
-    def leader(self) -> Population: ...
+    def leader(self) -> Population:
+        """The population that decides about experiences."""
+
     @property
-    def populations(self) -> dict[str, Population]: ...
-    def parts(self) -> dict[str, Mergeable]: ...
-    def state_dict(self) -> dict[str, Tensor]: ...
+    def populations(self) -> dict[str, Population]:
+        """All populations by kind."""
+
+    def parts(self) -> dict[str, Mergeable]:
+        """The parts of the state by name."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The whole state."""
 
 
 def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:

@@ -42,9 +42,7 @@ def find_match(loaded: Mapped, partial: Mapped) -> Found:
     """
     apart = differing(loaded, partial)
     if apart:
-        return Found(
-            None, f"views or cells were made with different configs: {'; '.join(apart)}"
-        )
+        return Found(None, f"views or cells were made with different configs: {'; '.join(apart)}")
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:
             return Found(None, f"the {name} map is empty")

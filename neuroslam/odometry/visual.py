@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neuroslam.config.sections import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.sensors.frames import check_picture
 from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
@@ -170,13 +171,9 @@ class VisualOdometry(AboutNow):
         """Compare a picture with the one before it; nothing changes. See :meth:`forward`."""
         if not dt_s > 0.0:
             raise BadFrame(f"VisualOdometry: {dt_s} s since the last picture; expected more than 0")
-        if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+        check_picture(image, "VisualOdometry")
+        if image.ndim == 3:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        if image.ndim != 2 or image.dtype != np.uint8:
-            raise BadFrame(
-                f"VisualOdometry: picture is {image.dtype} {image.shape}; "
-                "expected uint8, (h, w) or (h, w, 3)"
-            )
         height, width = image.shape
         first = self.size.height == 0
         if not first and (height, width) != (self.size.height, self.size.width):

@@ -1,6 +1,7 @@
 """What a page tells of a run: facts as plain values, everything long as arrays."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import cv2
@@ -8,11 +9,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from neuroslam.brain import NavigationBrain
+from neuroslam.cells.navigation import NavigationCells
+from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
-from neuroslam.merging.merge import MergeReport
+from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
 from neuroslam.runs.reading import odometry_track, places_of, trajectory, true_poses
@@ -200,28 +203,41 @@ def template_pictures(brain: NavigationBrain) -> np.ndarray:
 def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
     """The activity of the cells at the end of the run, and place cells with what they know."""
     arrays = {}
-    if brain.config.has("pose"):
-        activity = brain.pose_cells.activity.numpy(force=True)
-        arrays |= {"activity_xy": activity.sum(axis=0), "activity_theta_x": activity.sum(axis=1)}
-    if brain.config.has("place"):
-        place = brain.navigation.place
-        centres, links = (part.numpy(force=True) for part in place.graph())
-        n = len(centres)
-        wall = brain.navigation.walls.remembered()[0]
-        x, y, bearing, distance = (column.numpy(force=True) for column in wall[:4])
-        arrays |= {
-            "cell_x_m": centres[:, 0],
-            "cell_y_m": centres[:, 1],
-            "cell_visits": place.visits[0, :n].numpy(force=True).astype(np.int32),
-            "cell_time_s": place.time_s[0, :n].numpy(force=True),
-            "cell_links": links.astype(np.int32),
-            "wall_x_m": x + distance * np.cos(bearing),
-            "wall_y_m": y + distance * np.sin(bearing),
-            "wall_bearing_rad": bearing,
-        }
+    for kind, population in brain.populations.items():
+        if kind in _ARRAYS:
+            arrays |= _ARRAYS[kind](population)
     if (spots := brain.landmarks_m) is not None:
         arrays |= {"landmark_x_m": spots[:, 0], "landmark_y_m": spots[:, 1]}
     return arrays
+
+
+def _pose_cells(cells: PoseCellNetwork) -> dict[str, np.ndarray]:
+    activity = cells.activity.numpy(force=True)
+    return {"activity_xy": activity.sum(axis=0), "activity_theta_x": activity.sum(axis=1)}
+
+
+def _navigation_cells(cells: NavigationCells) -> dict[str, np.ndarray]:
+    centres, links = (part.numpy(force=True) for part in cells.place.graph())
+    n = len(centres)
+    wall = cells.walls.remembered()[0]
+    x, y, bearing, distance = (column.numpy(force=True) for column in wall[:4])
+    return {
+        "cell_x_m": centres[:, 0],
+        "cell_y_m": centres[:, 1],
+        "cell_visits": cells.place.visits[0, :n].numpy(force=True).astype(np.int32),
+        "cell_time_s": cells.place.time_s[0, :n].numpy(force=True),
+        "cell_links": links.astype(np.int32),
+        "wall_x_m": x + distance * np.cos(bearing),
+        "wall_y_m": y + distance * np.sin(bearing),
+        "wall_bearing_rad": bearing,
+    }
+
+
+_ARRAYS: dict[str, Callable[[Any], dict[str, np.ndarray]]] = {
+    "pose": _pose_cells,
+    "place": _navigation_cells,
+}
+"""What the page draws of the package's own populations."""
 
 
 def lost_spans(run: FinishedRun) -> list[tuple[int, int]]:
@@ -339,12 +355,16 @@ def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
     plain = BrainConfig()
     general: dict[str, Any] = {"section": "brain", "used": True, "rows": []}
     sections = [general]
+    own = {kind: section for kind, section in (config.model_extra or {}).items()}
+    for name, section in own.items():
+        rows = _parameters(section, type(section)(), "")
+        sections.append({"section": name, "used": name in config.cells, "rows": rows})
     for name, field in BrainConfig.model_fields.items():
         value, default = getattr(config, name), getattr(plain, name)
         if not isinstance(value, BaseModel):
             general["rows"].append(_parameter(name, value, default, field.description))
             continue
-        used = name not in _USED_BY or config.has(_USED_BY[name])
+        used = name not in _USED_BY or _USED_BY[name] in config.cells
         sections.append({"section": name, "used": used, "rows": _parameters(value, default, "")})
     return sections
 

@@ -15,7 +15,7 @@ from neuroslam.errors import RunError
 from neuroslam.report.collect import Facts, collect
 from neuroslam.report.pictures import Pictures, take_pictures
 from neuroslam.report.reading import read_run
-from neuroslam.runs.files import RUN_FILES, write_text
+from neuroslam.runs.files import run_files, write_text
 
 SCRIPTS = (
     "data.js", "view.js", "map.js", "marks.js", "charts.js", "cells.js", "panels.js", "tables.js",
@@ -56,7 +56,7 @@ def write_report(
         raise RunError(f"--pictures {pictures_mb:g}: expected megabytes, 0 for none")
     if to.is_dir():
         raise RunError(f"{to}: is a folder; expected a file to write")
-    if to.resolve() in {(out / name).resolve() for name in RUN_FILES}:
+    if to.resolve() in {(out / name).resolve() for name in run_files(out)}:
         raise RunError(f"{to}: is a file of the run, which would be lost; take another name")
     run = read_run(out)
     page = make_page(collect(run), take_pictures(run, int(1e6 * pictures_mb)))

@@ -135,7 +135,7 @@ def _write_graphml(brain: NavigationBrain, to: Path) -> None:
 
 
 def _write_nir(brain: NavigationBrain, to: Path) -> None:
-    if not brain.config.has("semantic") or brain.config.semantic.tier != "spiking":
+    if "semantic" not in brain.populations or brain.config.semantic.tier != "spiking":
         raise ConfigError(
             f"{to}: the brain has no spiking neurons; run it with semantic cells and "
             "--set semantic.tier=spiking"

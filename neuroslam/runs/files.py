@@ -34,7 +34,7 @@ RUN_FILES = (
     "experiences.csv", "links.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
 LANDMARKS_FILE = "landmarks.csv"
-"""Besides, where the brain has a semantic map."""
+"""Besides, where the brain has a semantic map; other populations may write tables, too."""
 
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
 """Figures of a run that differ from one time to the next; all others do not."""
@@ -103,6 +103,16 @@ def refuse_many(out: Path) -> None:
     raise RunError(f"{out}: is {what}")
 
 
+def run_files(out: Path) -> tuple[str, ...]:
+    """Name all files of a run, those that the run in a folder wrote for its populations, too."""
+    try:
+        tables = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["tables"]
+        own = [name for name in tables if isinstance(name, str) and Path(name).name == name]
+    except (OSError, ValueError, KeyError, TypeError):  # there is no run, or an older one
+        own = []
+    return (*RUN_FILES, *dict.fromkeys([LANDMARKS_FILE, *own]))
+
+
 def require_free(out: Path, source: str, overwrite: bool) -> None:
     """Make sure that a new run in a folder destroys nothing that it should not.
 
@@ -111,9 +121,10 @@ def require_free(out: Path, source: str, overwrite: bool) -> None:
     """
     if out.exists() and not out.is_dir():
         raise RunError(f"{out}: is a file; expected a folder to write")
-    if Path(source) in (out.resolve(), *(out.resolve() / name for name in RUN_FILES)):
+    written = run_files(out)
+    if Path(source) in (out.resolve(), *(out.resolve() / name for name in written)):
         raise RunError(f"{out}: is where the source is, which would change; take another folder")
-    if not overwrite and any((out / name).exists() for name in RUN_FILES):
+    if not overwrite and any((out / name).exists() for name in written):
         raise RunError(f"{out}: holds a run already; resume it, take another folder or --overwrite")
 
 
@@ -132,7 +143,7 @@ class RowWriter:
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
                 _remove_halves(out)
                 shutil.rmtree(out / "events", ignore_errors=True)
-                for name in (*RUN_FILES[2:], LANDMARKS_FILE):  # none would fit the new rows
+                for name in run_files(out)[2:]:  # none would fit the new rows
                     (out / name).unlink(missing_ok=True)
                 frames.write(FRAME_COLUMNS + "\n")
                 yield cls(frames, trace)
@@ -195,7 +206,7 @@ class RowWriter:
 
 def _remove_halves(out: Path) -> None:
     """Remove what a run that was killed while it wrote a file has left of it."""
-    for name in RUN_FILES:
+    for name in run_files(out):
         for half in out.glob(f".{name}.*.tmp"):
             half.unlink(missing_ok=True)
 
@@ -211,15 +222,6 @@ def experiences_csv(brain: NavigationBrain) -> str:
     )
     lines = [f"{i},{x!r},{y!r},{t!r},{v},{f}" for i, ((x, y, t), v, f) in enumerate(rows)]
     return "\n".join(["id,x_m,y_m,theta_rad,template,first_frame", *lines]) + "\n"
-
-
-def landmarks_csv(brain: NavigationBrain) -> str:
-    """Write what the semantic map knows: name,x_m,y_m,seen,first_frame,experience."""
-    known = brain.semantic.landmarks()
-    columns = ("name", "place_m", "seen", "first_frame", "experience")
-    rows = zip(*(known[column].tolist() for column in columns), strict=True)
-    lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e in rows]
-    return "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines]) + "\n"
 
 
 def links_csv(links: Links) -> str:

@@ -50,7 +50,7 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
         ("cells", "+".join(config.cells)),
-        *(_views(config) if config.has("pose") else []),
+        *(_views(config) if "pose" in config.cells else []),
     ]
     origins = brain.map.origins()
     made = Counter(origins.session.tolist())
@@ -68,14 +68,28 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
 
 def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
     links = brain.map.links
-    return [
-        *([("views", str(brain.view.n))] if brain.config.has("pose") else []),
+    rows = [("views", str(brain.view.n))] if brain.view.n or brain.leader.needs_views else []
+    rows += [
         ("experiences", str(brain.map.n)),
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
-        *_navigation_counts(brain),
-        *([("landmarks", str(brain.semantic.n))] if brain.config.has("semantic") else []),
     ]
+    for population in brain.populations.values():
+        rows += [_count(name, value) for name, value in population.counts().items()]
+    return rows
+
+
+def _count(name: str, value: float) -> tuple[str, str]:
+    """Write a count for a reader; the end of its name may be its unit.
+
+    Example:
+        >>> _count("place_cells", 3), _count("lost_s", 1.25)
+        (('place cells', '3'), ('lost', '1.2 s'))
+    """
+    if name.endswith(("_s", "_m", "_hz")):
+        name, _, unit = name.rpartition("_")
+        return name.replace("_", " "), f"{value:.1f} {unit}"
+    return name.replace("_", " "), f"{value:g}"
 
 
 def _views(config: BrainConfig) -> list[tuple[str, str]]:
@@ -87,18 +101,6 @@ def _views(config: BrainConfig) -> list[tuple[str, str]]:
             f"threshold {view.threshold}",
         ),
         ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
-    ]
-
-
-def _navigation_counts(brain: NavigationBrain) -> list[tuple[str, str]]:
-    if not brain.config.has("place"):
-        return []
-    cells = brain.navigation
-    return [
-        ("place cells", str(int(cells.place.n_cells))),
-        ("stretches of wall", str(int(cells.walls.n_walls))),
-        ("activated boundary cells", str(int(cells.familiarity.n_activated()))),
-        ("lost for", f"{cells.now.lost_s:.1f} s"),
     ]
 
 

@@ -10,14 +10,13 @@ import torch
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import RunError
 from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import MergeReport, merge
+from neuroslam.merging.report import MergeReport
 from neuroslam.runs.files import (
     FRAME_COLUMNS,
-    LANDMARKS_FILE,
-    RUN_FILES,
     RunPlan,
     brain_file,
     require_free,
+    run_files,
 )
 from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.reading import read_plan
@@ -47,7 +46,7 @@ def join_brains(
     found = find_match(loaded, partial)
     if found.match is None:
         return None, [_refusal(found.reason, loaded, partial)]
-    merged, report = merge(loaded, partial, found.match)
+    merged, report = loaded.merge(partial, found.match)
     report.found = found.reason
     reports = [report]
     if merged is None:
@@ -74,8 +73,8 @@ def _join_one(
         if found.match is None:
             continue
         alone = NavigationBrain(brain.config)
-        alone.take(brain.state_dict(), stored[:i] + stored[i + 1 :])
-        merged, report = merge(other, alone, found.match)
+        alone.restore(brain.state_dict(), stored[:i] + stored[i + 1 :])
+        merged, report = other.merge(alone, found.match)
         if merged is not None:
             return merged, report
     return None
@@ -161,9 +160,11 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
                     (beside / file).write_text(empty)
             summary = write_results(brain, plan, beside, RunSummary())
             out.mkdir(exist_ok=True)
-            for file in ("brain.safetensors", *RUN_FILES, LANDMARKS_FILE):
+            for file in ("brain.safetensors", *dict.fromkeys(run_files(out) + run_files(beside))):
                 if (beside / file).exists():
                     (beside / file).replace(out / file)
+                else:  # of an earlier run: it would not fit the new map
+                    (out / file).unlink(missing_ok=True)
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary

@@ -1,96 +1,113 @@
-"""TensorBoard panels of cells, as an animal's own brain has the world; and of SSP-SLAM."""
+"""TensorBoard panels that collect over time what a population did, and draw it."""
 
-from collections import deque
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
+from neuroslam.cells.navigation import NavigationCells
 from neuroslam.evaluation.gridness import autocorrelogram, gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
-from neuroslam.figures.landmarks import Query, plot_queries
 from neuroslam.figures.places import plot_place_cells
-from neuroslam.figures.spikes import plot_rasters
-from neuroslam.figures.style import ACTIVITY, STYLE, new_figure
-from neuroslam.spiking.ensemble import NeuronArray
-from neuroslam.spiking.slam import SSPSLAM, SSPStep
-from neuroslam.worlds.landmarks import LandmarkWorld
+from neuroslam.figures.style import ACTIVITY, STYLE, new_figure, render
+from neuroslam.runs.semantic_panels import SemanticPanels, known_landmarks
+from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.state.population import Population
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
-
-    from neuroslam.brain import NavigationBrain
 
 _BINS_A_FIELD = 10  # in the smallest spacing: finer ones stay unvisited for long
 _LEAST_SAMPLES = 200
 _CELLS_SHOWN = 4  # of as many modules
 _MOST_SAMPLES = 100_000
 
-_NEURONS_SHOWN = 100  # of a population
-_RASTER_STEPS = 500
-_GRID = 61
+
+class Panels(ABC):
+    """Watches one population of a brain for a recorder, beyond its own scalars and images."""
+
+    @abstractmethod
+    def note(self, population: Population) -> None:
+        """Take note of a frame; a brain that joins or starts a map has another population."""
+
+    @abstractmethod
+    def write_scalars(self, frame: int) -> None:
+        """Write curves."""
+
+    @abstractmethod
+    def write_figures(self, frame: int) -> None:
+        """Write figures, which cost ever more as a run goes on."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop watching."""
 
 
-class CellPanels:
-    """Collects what the cells of a brain did, and draws it.
+class NavigationPanels(Panels):
+    """Draws rate maps of grid cells, responses of boundary cells and the map of place cells.
 
-    Positions are those that the brain believes: nobody else knows where it is. Of a long life every
-    other sample is dropped whenever there are too many.
+    Positions are those that the brain believes. Of a long run every other sample is dropped
+    whenever there are too many.
 
     Args:
+        writer: Of TensorBoard.
         every: Frames between two samples.
     """
 
-    def __init__(self, every: int = 2) -> None:
-        self.every = every
+    def __init__(self, writer: "SummaryWriter", every: int = 2) -> None:
+        self.writer, self.every = writer, every
+        self._cells: NavigationCells | None = None
         self._seen = 0
         self._positions: list[np.ndarray] = []
         self._rates: list[np.ndarray] = []
         self._boundary: list[float] = []
 
-    def note(self, brain: "NavigationBrain") -> None:
+    def note(self, population: Population) -> None:
         """Take a sample, where one is due."""
+        assert isinstance(population, NavigationCells)
+        self._cells = population
         self._seen += 1
         if self._seen % self.every:
             return
-        cells = brain.navigation
-        self._positions.append(cells.oscillators.position_m.numpy(force=True).copy())
-        self._rates.append(cells.grid.rates.flatten().half().numpy(force=True))
-        self._boundary.append(float(cells.boundary.rates.max()))
+        self._positions.append(population.oscillators.position_m.numpy(force=True).copy())
+        self._rates.append(population.grid.rates.flatten().half().numpy(force=True))
+        self._boundary.append(float(population.boundary.rates.max()))
         if len(self._positions) > _MOST_SAMPLES:
             self.every *= 2
             for kept in (self._positions, self._rates, self._boundary):
                 del kept[1::2]
 
-    def scalars(self, brain: "NavigationBrain") -> dict[str, float]:
-        """Return the figures of now, by tag."""
-        cells = brain.navigation
-        return {
-            "cells/place_cells": float(cells.place.n_cells),
-            "cells/walls": float(cells.walls.n_walls),
-            "cells/activated_boundary_cells": float(cells.familiarity.n_activated()),
-            "cells/boundary_activity": float(cells.boundary.activity),
-            "cells/doubt_s": float(cells.familiarity.doubt_s),
-        }
+    def write_scalars(self, frame: int) -> None:
+        """Write nothing: the curves of navigation cells are their own."""
 
-    def draw(self, brain: "NavigationBrain") -> tuple[dict[str, Figure], dict[str, float]]:
+    def write_figures(self, frame: int) -> None:
+        """Draw all panels, and write the grid scores of the modules."""
+        if self._cells is None:
+            return
+        figures, scores = self.draw(self._cells)
+        for tag, drawn in figures.items():
+            self.writer.add_image(tag, render(drawn), frame, dataformats="HWC")
+        for tag, score in scores.items():
+            self.writer.add_scalar(tag, score, frame)
+
+    def close(self) -> None:
+        """Do nothing: samples are taken, not sent."""
+
+    def draw(self, cells: NavigationCells) -> tuple[dict[str, Figure], dict[str, float]]:
         """Draw all panels; returns them, and the grid scores of the modules, by tag."""
         path = np.array(self._positions).reshape(-1, 2)
-        cells = brain.navigation
         figures = {"cells/place_map": plot_place_cells(*cells.remembered(), cells.pose, path)}
         scores: dict[str, float] = {}
         if len(self._positions) >= _LEAST_SAMPLES:
             at = np.array(self._positions)
             figures["cells/boundary_response"] = self._draw_boundary(at)
-            figures["cells/grid_rate_maps"], scores = self._draw_grid(brain, at)
+            figures["cells/grid_rate_maps"], scores = self._draw_grid(cells, at)
         return figures, scores
 
-    def _draw_grid(
-        self, brain: "NavigationBrain", at: np.ndarray
-    ) -> tuple[Figure, dict[str, float]]:
-        config = brain.config.grid_cells
+    def _draw_grid(self, cells: NavigationCells, at: np.ndarray) -> tuple[Figure, dict[str, float]]:
+        config = cells.config.grid_cells
         bins = Bins.around(at, min(config.spacings_m) / _BINS_A_FIELD)
         rates = np.array(self._rates, dtype=np.float64)
         maps = rate_map(at, rates, bins)
@@ -134,77 +151,47 @@ class CellPanels:
         return figure
 
 
-class SemanticPanels:
-    """Writes what SSP-SLAM does, as the ``watch`` of :meth:`~neuroslam.spiking.slam.SSPSLAM.run`.
-
-    Of a batch the first animal is shown.
+class LandmarkPanels(Panels):
+    """Draws what the map of landmarks recalls, and the spikes of SSP-SLAM.
 
     Args:
-        slam: Whose steps they are.
-        writer: To write to.
-        world: Its landmarks are drawn beside the answers; ``None``: no answers.
-        every: Steps between two scalars; pictures are ten times as rare.
+        writer: Of TensorBoard.
     """
 
-    def __init__(
-        self,
-        slam: SSPSLAM,
-        writer: "SummaryWriter",
-        world: LandmarkWorld | None = None,
-        every: int = 100,
-    ) -> None:
-        self.slam, self.writer, self.world, self.every = slam, writer, world, every
-        self._fired: dict[str, deque[np.ndarray]] = {}
-        for name, part in slam.named_modules():
-            if isinstance(part, NeuronArray):
-                self._fired[name.removesuffix(".neurons")] = deque(maxlen=_RASTER_STEPS)
+    def __init__(self, writer: "SummaryWriter") -> None:
+        self.writer = writer
+        self._watched: tuple[SemanticCells, SemanticPanels] | None = None
 
-    def __call__(self, _step: int, said: SSPStep) -> None:
-        """Take a step; its time is the animal's own, so that a life that goes on is one curve."""
-        now = round(float(self.slam.time_s) / self.slam.config.time_step_s)
-        for name, part in self.slam.named_modules():
-            if isinstance(part, NeuronArray):
-                flat = part.spikes[:, 0].flatten()
-                some = flat[torch.linspace(0, len(flat) - 1, min(_NEURONS_SHOWN, len(flat))).long()]
-                self._fired[name.removesuffix(".neurons")].append(some.numpy(force=True))
-        if now % self.every == 0:
-            self._scalars(said, now)
-        if now % (10 * self.every) == 0:
-            self._pictures(now)
+    def note(self, population: Population) -> None:
+        """Watch the steps of SSP-SLAM."""
+        assert isinstance(population, SemanticCells)
+        if self._watched is not None and self._watched[0] is population:
+            return
+        self.close()
+        panels = SemanticPanels(population.slam, self.writer)
+        population.watch = panels.note
+        self._watched = population, panels
 
-    def _scalars(self, said: SSPStep, now: int) -> None:
-        values = {"recall": said.recall, "agreement": said.agreement, "gate": said.gate}
-        for name, value in values.items():
-            self.writer.add_scalar(f"ssp/{name}", float(value[0]), now)
-        self.writer.add_scalar("ssp/lost", float(said.lost[0]), now)
-        dt = self.slam.config.time_step_s
-        for name, fired in self._fired.items():
-            rates = np.mean(fired, axis=0) / dt
-            self.writer.add_scalar(f"ssp_rate_hz/{name}", float(rates.mean()), now)
-            self.writer.add_histogram(f"ssp_rates_hz/{name}", rates, now)
+    def write_scalars(self, frame: int) -> None:
+        """Write what the last step of SSP-SLAM said."""
+        if self._watched is not None:
+            self._watched[1].write_scalars(frame)
 
-    def _pictures(self, now: int) -> None:
-        dt = self.slam.config.time_step_s
-        if self._fired:
-            shown = {name: np.stack(fired) > 0 for name, fired in self._fired.items()}
-            steps = len(next(iter(shown.values())))
-            figure = plot_rasters(shown, dt, (now - steps) * dt, "Spikes of the last half second")
-            self.writer.add_figure("ssp/spikes", figure, now)
-        if self.world is not None and self.slam.space.dimension == 2:
-            with torch.inference_mode():
-                self.writer.add_figure("ssp/map", self._answers(), now)
+    def write_figures(self, frame: int) -> None:
+        """Draw what the map recalls."""
+        if self._watched is not None:
+            cells, panels = self._watched
+            panels.write_pictures(frame, known_landmarks(cells))
 
-    def _answers(self) -> object:
-        slam, world = self.slam, self.world
-        (x0, x1), (y0, y1) = world.bounds_m
-        x, y = torch.linspace(x0, x1, _GRID), torch.linspace(y0, y1, _GRID)
-        at = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
-        phi = slam.map.read(slam.pointers)[0]
-        alike = slam.space.similarity(phi, at).reshape(len(phi), _GRID, _GRID)
-        queries = [
-            Query(name, picture.numpy(force=True), [name])
-            for name, picture in zip(slam.names, alike, strict=True)
-        ]
-        now_at = slam.space.similarity(slam.space.from_fourier(slam.integrator.z)[0], at)
-        now_at = Query("the animal", now_at.reshape(_GRID, _GRID).numpy(force=True), [])
-        return plot_queries(world, None, [now_at, *queries[:7]], "What the map recalls now")
+    def close(self) -> None:
+        """Stop watching."""
+        if self._watched is not None:
+            self._watched[0].watch = None
+            self._watched = None
+
+
+PANELS: dict[str, type[NavigationPanels] | type[LandmarkPanels]] = {
+    "place": NavigationPanels,
+    "semantic": LandmarkPanels,
+}
+"""Panels of the package's own populations; all others have their scalars and images."""

@@ -2,13 +2,18 @@
 
 import textwrap
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from neuroslam.brain import NavigationBrain, load_brain
+from neuroslam.cells.navigation import NavigationCells
+from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.errors import RunError, counted
-from neuroslam.figures.maps import plot_map, plot_pose_cells, plot_signals
+from neuroslam.figures.maps import plot_activity, plot_map, plot_pose_cells, plot_signals
 from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import plain_text, save, shortened
 from neuroslam.runs.files import RunPlan
@@ -39,20 +44,36 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
     try:
         to.mkdir(parents=True, exist_ok=True)
         draw_map(brain, plan, trace, to / "map.png")
-        figures = {"signals.png": plot_signals(frames, brain.config.view.threshold)}
-        if brain.config.has("place"):
-            cells, path = brain.navigation, trajectory(brain, trace)[:, :2]
-            drawn = plot_place_cells(*cells.remembered(), cells.pose, path)
-            figures = {"place_cells.png": drawn} | figures
-        if brain.config.has("pose"):
-            cells = brain.pose_cells
-            drawn = plot_pose_cells(cells.activity.numpy(), cells.estimate)
-            figures = {"pose_cells.png": drawn} | figures
+        path = trajectory(brain, trace)[:, :2]
+        figures = {}
+        for kind, population in brain.populations.items():
+            if kind in _DRAWN:
+                figures |= _DRAWN[kind](population, path)
+            else:
+                for tag, picture in population.images().items():
+                    figures[f"{tag.replace('/', '_')}.png"] = plot_activity(picture, tag)
+        figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():
             save(figure, to / name)
     except OSError as error:
         raise RunError(f"{to}: cannot be written ({error.strerror or error})") from None
     return [to / name for name in ("map.png", *figures)]
+
+
+def _draw_pose_cells(cells: PoseCellNetwork, _path: np.ndarray) -> dict[str, Figure]:
+    return {"pose_cells.png": plot_pose_cells(cells.activity.numpy(), cells.estimate)}
+
+
+def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Figure]:
+    return {"place_cells.png": plot_place_cells(*cells.remembered(), cells.pose, path)}
+
+
+_DRAWN: dict[str, Callable[[Any, np.ndarray], dict[str, Figure]]] = {
+    "pose": _draw_pose_cells,
+    "place": _draw_place_cells,
+    "semantic": lambda _cells, _path: {},  # its landmarks are on the map
+}
+"""Figures of the package's own populations; all others have their images drawn."""
 
 
 def draw_map(

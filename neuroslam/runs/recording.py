@@ -13,7 +13,8 @@ import torch
 from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import render
-from neuroslam.runs.panels import CellPanels
+from neuroslam.runs.panels import PANELS, Panels
+from neuroslam.state.population import Picture
 from neuroslam.types import Frame, StepResult
 
 if TYPE_CHECKING:
@@ -64,6 +65,11 @@ class TensorBoardRecorder(Recorder):
     images ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, ever
     rarer as they cost ever more.
 
+    A brain with a semantic map has besides: landmarks, how long they contradict, and of the last
+    step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate`` and ``ssp/lost``; rates of its
+    populations, where they are neurons; and as rarely as those the images ``ssp/map``, what the
+    map recalls for the landmarks seen most often, and ``ssp/spikes``.
+
     Args:
         folder: Where the event files go; made if missing.
         scalars_every: Frames between two points of a curve.
@@ -93,8 +99,8 @@ class TensorBoardRecorder(Recorder):
         self._drawn = -1
         self._clock = (time.perf_counter(), 0)
         self._seen = 0
-        self._cells: CellPanels | None = None
-        self._cells_due = 0  # frame
+        self._panels: dict[str, Panels] = {}
+        self._panels_due = 0  # frame
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
         except OSError as error:
@@ -104,9 +110,11 @@ class TensorBoardRecorder(Recorder):
         """Write what is due at this frame."""
         self._last = (result.frame, brain)
         self._seen += 1
-        if brain.config.has("place"):
-            self._cells = self._cells or CellPanels()
-            self._cells.note(brain)
+        for kind, population in brain.populations.items():
+            if kind in PANELS:
+                if kind not in self._panels:
+                    self._panels[kind] = PANELS[kind](self._writer)
+                self._panels[kind].note(population)
         if result.frame % self.scalars_every == 0:
             self._write_scalars(result, brain)
         if result.frame % self.images_every == 0:
@@ -115,9 +123,9 @@ class TensorBoardRecorder(Recorder):
                 template = brain.view.template_image(result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
-            if brain.config.has("pose"):
-                picture = activity_picture(brain.pose_cells.activity.numpy(force=True))
-                self._write_picture("cells/activity", picture, result.frame)
+            for population in brain.populations.values():
+                for tag, picture in population.images().items():
+                    self._write_picture(tag, coloured(picture), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
 
@@ -130,6 +138,8 @@ class TensorBoardRecorder(Recorder):
                 self._write_map(frame, brain, last=True)
             if brain.view.n:
                 self._write_projector(frame, brain)
+        for panels in self._panels.values():
+            panels.close()
         self._writer.close()
 
     def _write_scalars(self, result: StepResult, brain: "NavigationBrain") -> None:
@@ -144,13 +154,10 @@ class TensorBoardRecorder(Recorder):
         }
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
-        if brain.config.has("pose"):
-            values["cells/peak"] = brain.pose_cells.peak
-        if self._cells is not None:
-            values |= self._cells.scalars(brain)
-        if brain.config.has("semantic"):
-            values["semantic/landmarks"] = brain.semantic.n
-            values["semantic/contradicted_s"] = float(brain.semantic.slam.contradicted_s[0])
+        for population in brain.populations.values():
+            values |= population.scalars()
+        for panels in self._panels.values():
+            panels.write_scalars(result.frame)
         for tag, value in values.items():
             self._writer.add_scalar(tag, value, result.frame)
 
@@ -163,13 +170,10 @@ class TensorBoardRecorder(Recorder):
             landmarks=brain.landmarks_m,
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
-        if self._cells is not None and (last or frame >= self._cells_due):
-            self._cells_due = frame + max(self.maps_every, frame // 2)
-            figures, scores = self._cells.draw(brain)
-            for tag, drawn in figures.items():
-                self._write_picture(tag, render(drawn), frame)
-            for tag, score in scores.items():
-                self._writer.add_scalar(tag, score, frame)
+        if last or frame >= self._panels_due:
+            self._panels_due = frame + max(self.maps_every, frame // 2)
+            for panels in self._panels.values():
+                panels.write_figures(frame)
         self._drawn = frame
 
     def _write_picture(self, tag: str, picture: np.ndarray, frame: int) -> None:
@@ -210,31 +214,33 @@ def frame_beside_template(image: np.ndarray, template: np.ndarray | None) -> np.
     return np.concatenate(rows)
 
 
-def activity_picture(activity: np.ndarray) -> np.ndarray:
-    """Colour the activity of pose cells: left x and y, right x and heading.
+def coloured(picture: Picture) -> np.ndarray:
+    """Colour the activity of a population: dark is silent, yellow the peak of each layer.
 
-    Every cell is a block of at least 200 / n pixels; y and heading point up, dark is silent,
-    yellow the peak.
+    Every cell is a block of at least 200 / n pixels, n being the smallest side; rows point up.
 
     Args:
-        activity: ``(n_theta, n_y, n_x)``.
+        picture: Activity ``(h, w)``; a tuple of such layers, which are put side by side; or a
+            picture that has colours already, ``uint8``, ``(h, w, 3)``.
 
     Returns:
-        ``uint8``, ``(h, w, 3)``, h and each half at least 200.
+        ``uint8``, ``(h, w, 3)``.
 
     Example:
-        >>> activity_picture(np.ones((36, 21, 21), np.float32)).shape
+        >>> coloured((np.ones((21, 21)), np.ones((36, 21)))).shape
         (210, 428, 3)
     """
-    above, side = activity.sum(axis=0), activity.sum(axis=1)
-    block = math.ceil(200 / min(above.shape))
-    height, width = above.shape[0] * block, above.shape[1] * block
-    halves = []
-    for layer in (above, side):
-        grey = (255.0 * layer / (layer.max() or 1.0)).round().astype(np.uint8)
+    layers = picture if isinstance(picture, tuple) else (picture,)
+    if layers[0].ndim == 3:
+        return layers[0]
+    block = math.ceil(200 / min(layers[0].shape))
+    height, width = (side * block for side in layers[0].shape)
+    gap, parts = np.full((height, 8, 3), 255, np.uint8), []
+    for layer in layers:
+        grey = (255.0 * layer / (layer.max() or 1.0)).round().clip(0, 255).astype(np.uint8)
         large = cv2.resize(grey[::-1], (width, height), interpolation=cv2.INTER_NEAREST)
-        halves.append(cv2.applyColorMap(large, cv2.COLORMAP_VIRIDIS)[..., ::-1])
-    return np.concatenate([halves[0], np.full((height, 8, 3), 255, np.uint8), halves[1]], axis=1)
+        parts += [gap, cv2.applyColorMap(large, cv2.COLORMAP_VIRIDIS)[..., ::-1]]
+    return np.concatenate(parts[1:], axis=1)
 
 
 def _widened(image: np.ndarray) -> np.ndarray:

@@ -14,10 +14,8 @@ from neuroslam.errors import MapError, RunError
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import (
-    LANDMARKS_FILE,
     RunPlan,
     experiences_csv,
-    landmarks_csv,
     links_csv,
     write_text,
 )
@@ -42,6 +40,7 @@ class RunSummary:
     merges: list[dict[str, Any]] = field(default_factory=list)
     refusals: list[dict[str, Any]] = field(default_factory=list)
     not_joined: list[dict[str, Any]] = field(default_factory=list)
+    tables: list[str] = field(default_factory=list)
     unplaced: int = 0
     failure: str = ""
 
@@ -63,6 +62,7 @@ class RunSummary:
             "skipped": self.skipped,
             "unused": self.unused,
             "pictures": self.pictures,
+            "tables": self.tables,
             "interrupted": self.interrupted,
             **self.accuracy,
         }
@@ -100,16 +100,11 @@ def write_results(
         "links": brain.map.n_links,
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
-    if brain.config.has("place"):
-        cells = brain.navigation
-        summary.counts |= {
-            "place_cells": int(cells.place.n_cells),
-            "walls": int(cells.walls.n_walls),
-            "activated_boundary_cells": int(cells.familiarity.n_activated()),
-            "lost_s": round(cells.now.lost_s, 3),
-        }
-    if brain.config.has("semantic"):
-        summary.counts["landmarks"] = brain.semantic.n
+    tables: dict[str, str] = {}
+    for population in brain.populations.values():
+        summary.counts |= population.counts()
+        tables |= population.tables()
+    summary.tables = list(tables)
     if truth is not None:
         # A robot that has not moved: nothing tells how to lay its track over the truth.
         with contextlib.suppress(MapError):
@@ -124,8 +119,8 @@ def write_results(
         save_run(brain, plan, out, summary)
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
-        if brain.config.has("semantic"):
-            write_text(out / LANDMARKS_FILE, landmarks_csv(brain))
+        for name, table in tables.items():
+            write_text(out / name, table)
         write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
         draw_map(brain, plan, trace, out / "map.png")
     except OSError as error:

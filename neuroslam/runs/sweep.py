@@ -269,7 +269,7 @@ def _map(order: _Order) -> dict[str, Any]:
     return run_one(trial.source, order.out / trial.name, trial.config, **given)
 
 
-def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:
+def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:  # noqa: ANN401
     """Make one run of many; arguments are those of :func:`neuroslam.runs.run.run`.
 
     Returns:

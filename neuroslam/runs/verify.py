@@ -6,38 +6,30 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, read_checkpoint
 from neuroslam.config import BrainConfig
-from neuroslam.errors import NeuroslamError, counted
+from neuroslam.errors import NeuroslamError, counted, listed
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links
 from neuroslam.runs.files import (
-    LANDMARKS_FILE,
     brain_file,
     experiences_csv,
-    landmarks_csv,
     links_csv,
     missing_rows,
 )
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
 from neuroslam.state.mergeable import State
+from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, session_name
 from neuroslam.state.tables import GrowingTable
 
-_SUM_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
-
-# Infinite where there is none: a gap before this frame, and the end of a goal's time.
-_MAY_BE_INFINITE = ("clock.after_gap_s", "map.goals.until_s")
-
-_SHOWN = 5
+_MAY_BE_INFINITE = ("map.goals.until_s",)  # a goal without an end
 
 
 def verify(path: str | Path) -> list[str]:
@@ -121,11 +113,8 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
             wrong = tensor.isnan() if name in _MAY_BE_INFINITE else ~tensor.isfinite()
             if wrong.any():
                 rows = np.unique(wrong.numpy().nonzero()[0]) if tensor.dim() else []
-                yield f"{name}: not finite" + (f" in rows {_some(rows)}" if tensor.dim() else "")
+                yield f"{name}: not finite" + (f" in rows {listed(rows)}" if tensor.dim() else "")
     n_views, n = len(s["view.templates.pixels"]), len(s["map.experiences.template"])
-    bound = len(s["pose_cells.bindings.x"])
-    if bound != n_views:
-        yield f"{n_views} views, {bound} of them bound to pose cells"
     for name, limit, what in (
         ("map.experiences.template", n_views, "views"),
         ("map.links_table.source", n, "experiences"),
@@ -133,46 +122,45 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         ("map.goals.experience", n, "experiences"),
         ("map.aliases.experience", n, "experiences"),
     ):
-        lowest = -1 if not config.has("pose") and name.endswith("template") else 0
+        lowest = -1 if name.endswith("template") and not leading_class(config).relaxes_map else 0
         rows = np.flatnonzero((s[name] < lowest) | (s[name] >= limit))
         if len(rows):
-            yield f"{_row(name, rows)}: {name.split('.')[-1]} {_some(s[name][rows])}, " + (
+            yield f"{_row(name, rows)}: {name.split('.')[-1]} {listed(s[name][rows])}, " + (
                 f"there are {limit} {what}"
             )
-    for name, limit in (
-        ("map.state.current", n), ("view.last.template", n_views), ("pose_cells.last.view", n_views)
-    ):  # fmt: skip
+    for name, limit in (("map.state.current", n), ("view.last.template", n_views)):
         lowest = 0 if n and name == "map.state.current" else -1
         if not lowest <= s[name] < limit:
             yield f"{name}: is {s[name]}, expected {lowest} to {limit - 1}"
     yield from _link_faults(s, n)
-    yield from _cell_faults(state, config)
-    if config.has("place"):
-        yield from _navigation_faults(s, n if not config.has("pose") else None)
-    if config.has("semantic"):
-        yield from _semantic_faults(s, n)
+    yield from _bound_faults(s["map.experiences.cell"], config)
+    for population in population_classes(config):
+        own = f"{population.name}."
+        part = {key.removeprefix(own): v for key, v in s.items() if key.startswith(own)}
+        yield from population.faults(part, config, n_views, n)
     yield from _origin_faults(s, n)
 
 
-def _semantic_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
-    pointers, kinds = len(s["semantic.slam.pointers"]), len(s["semantic.known.kind"])
-    if pointers != max(1, kinds):
-        yield f"{kinds} landmarks, {pointers} pointers; each should have its own"
-    at = s["semantic.known.experience"]
-    rows = np.flatnonzero((at < -1) | (at >= n))
-    if len(rows):
-        yield f"landmarks {_some(rows)}: met at experiences {_some(at[rows])}, there are {n}"
+def _bound_faults(bound: np.ndarray, config: BrainConfig) -> Iterator[str]:
+    """Say which experiences are bound to cells that are not on the torus."""
+    cells = config.pose_cells
+    torus = (cells.n_theta, cells.n_xy, cells.n_xy)
+    for axis, limit in enumerate(torus[::-1]):
+        rows = np.flatnonzero((bound[:, axis] < 0) | (bound[:, axis] > limit))
+        if len(rows):
+            name = f"map.experiences.cell[{axis}]"
+            yield f"{name}: rows {listed(rows)} are not on the torus of {torus}"
 
 
 def _link_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
     links = Links(*(s[f"map.links_table.{name}"] for name in Links._fields))
     loops = np.flatnonzero(links.source == links.target)
     if len(loops):
-        yield f"links {_some(loops)}: lead from a place to itself, {_some(links.source[loops])}"
+        yield f"links {listed(loops)}: lead from a place to itself, {listed(links.source[loops])}"
     for name in ("distance_m", "duration_s"):
         rows = np.flatnonzero(getattr(links, name) < 0)
         if len(rows):
-            yield f"links {_some(rows)}: {name} {_some(getattr(links, name)[rows])} is negative"
+            yield f"links {listed(rows)}: {name} {listed(getattr(links, name)[rows])} is negative"
     there = (np.stack(links[:2]) >= 0).all(0) & (np.stack(links[:2]) < n).all(0)
     ends = links.source[there], links.target[there]
     parts, label = connected_components(coo_array((np.ones(len(ends[0])), ends), shape=(n, n)))
@@ -180,55 +168,9 @@ def _link_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
         first = np.unique(label, return_index=True)[1]
         sizes = sorted(np.bincount(label).tolist(), reverse=True)
         yield (
-            f"the map falls into {parts} parts, of {_some(sizes)} experiences; "
-            f"they begin at {_some(np.sort(first))}"
+            f"the map falls into {parts} parts, of {listed(sizes)} experiences; "
+            f"they begin at {listed(np.sort(first))}"
         )
-
-
-def _navigation_faults(s: dict[str, np.ndarray], n_experiences: int | None) -> Iterator[str]:
-    n_cells, n_walls = (
-        int(s[f"navigation.{name}"][0]) for name in ("place.n_cells", "walls.n_walls")
-    )
-    if n_experiences not in (None, n_cells):
-        yield f"{n_cells} place cells, {n_experiences} experiences; each should be the other"
-    linked = s["navigation.place.neighbours"][0, :n_cells]
-    rows = np.unique(np.nonzero((linked < -1) | (linked >= n_cells))[0])
-    if len(rows):
-        yield f"place cells {_some(rows)}: linked to cells that are not there; there are {n_cells}"
-    norms = np.linalg.norm(s["navigation.place.weights"][0, :n_cells], axis=1)
-    rows = np.flatnonzero(np.abs(norms - 1.0) > 1e-3)
-    if len(rows):
-        yield f"place cells {_some(rows)}: weights of norm {_some(norms[rows])}, expected 1"
-    active = s["navigation.walls.active"][0]
-    rows = np.flatnonzero((active < -1) | (active >= n_walls))
-    if len(rows):
-        yield f"active walls {_some(rows)}: not remembered; there are {n_walls}"
-    covariance = s["navigation.walls.covariance"][0]
-    if (np.diag(covariance) < 0).any():
-        yield "navigation.walls.covariance: a variance is negative"
-
-
-def _cell_faults(state: State, config: BrainConfig) -> Iterator[str]:
-    window, origin = state["pose_cells.window"], state["pose_cells.origin"].tolist()
-    torus = (config.pose_cells.n_theta, config.pose_cells.n_xy, config.pose_cells.n_xy)
-    sizes = tuple(window.shape)
-    if not all(0 < size <= limit for size, limit in zip(sizes, torus, strict=True)):
-        yield f"pose_cells.window: {sizes} cells do not fit the torus of {torus}"
-    if not all(0 <= at < limit for at, limit in zip(origin, torus, strict=True)):
-        yield f"pose_cells.origin: {tuple(origin)} is not on the torus of {torus}"
-    if (window < 0).any():
-        cell = tuple(torch.nonzero(window < 0)[0].tolist())
-        yield f"pose_cells.window: {int((window < 0).sum())} cells are negative, the first {cell}"
-    total = window.sum(dtype=torch.float64).item()
-    if abs(total - 1.0) > _SUM_TOLERANCE[window.dtype]:
-        yield f"pose_cells.window: adds up to {total:.6g}, expected 1"
-    places = {f"pose_cells.bindings.{x}": state[f"pose_cells.bindings.{x}"] for x in ("x", "y")}
-    places["pose_cells.bindings.theta"] = state["pose_cells.bindings.theta"]
-    places |= {f"map.experiences.cell[{i}]": state["map.experiences.cell"][:, i] for i in range(3)}
-    for (name, at), limit in zip(places.items(), 2 * torus[::-1], strict=True):
-        rows = np.flatnonzero(((at < 0) | (at > limit)).numpy())
-        if len(rows):
-            yield f"{name}: rows {_some(rows)} are not on the torus of {torus}"
 
 
 def _origin_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
@@ -249,17 +191,17 @@ def _origin_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
         unknown = np.flatnonzero(~np.isin(session, log))
         if len(unknown):
             names = sorted({session_name(one) for one in session[unknown].tolist()})
-            yield f"{table} {_some(unknown)}: of a session that is not in the log, {_some(names)}"
+            yield f"{table} {listed(unknown)}: of a session that is not in the log, {listed(names)}"
         wrong = np.flatnonzero((number < 0) | ((session == here) & (number >= made)))
         if len(wrong):
             yield (
-                f"{table} {_some(wrong)}: number {_some(number[wrong])} in their session, "
+                f"{table} {listed(wrong)}: number {listed(number[wrong])} in their session, "
                 f"which has made {made}"
             )
         for key, count in Counter(keys[table]).items():
             if count > 1:
                 rows = [i for i, other in enumerate(keys[table]) if other == key]
-                yield f"{table} {_some(rows)}: each is place {key[1]} of {session_name(key[0])}"
+                yield f"{table} {listed(rows)}: each is place {key[1]} of {session_name(key[0])}"
     own = {key: i for i, key in enumerate(keys["experiences"])}
     for i, key in enumerate(keys["aliases"]):
         now = int(s["map.aliases.experience"][i])
@@ -278,8 +220,8 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "experiences.csv": experiences_csv(brain),
         "links.csv": links_csv(brain.map.links),
     }
-    if brain.config.has("semantic"):
-        expected[LANDMARKS_FILE] = landmarks_csv(brain)
+    for population in brain.populations.values():
+        expected |= population.tables()
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:
@@ -315,25 +257,40 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
     apart[:, 2] = wrap_angles(apart[:, 2])
     wrong = np.flatnonzero((np.abs(apart) > 1e-6).any(1))
     if len(wrong):
-        yield f"{out / 'trajectory.tum'}: poses {_some(wrong)} are not where the brain has them"
+        yield f"{out / 'trajectory.tum'}: poses {listed(wrong)} are not where the brain has them"
 
 
 def _table_fault(path: Path, expected: str) -> str:
+    columns, *should = expected.splitlines()
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
-        rows = [[float(value) for value in line.split(",")] for line in lines]
+        if header != columns:
+            return f"its columns are {header!r}, expected {columns!r}"
+        rows = [_values(line) for line in lines]
     except (OSError, ValueError) as error:
         return f"cannot be read ({_why(error)})"
-    names, *should = expected.splitlines()
-    if header != names:
-        return f"its columns are {header!r}, expected {names!r}"
     if len(rows) != len(should):
         return f"{counted(len(rows), 'row')}, the brain has {len(should)}"
-    differ = [
-        i for i, (row, line) in enumerate(zip(rows, should, strict=True))
-        if row != [float(value) for value in line.split(",")]
-    ]  # fmt: skip
-    return f"rows {_some(differ)} differ from the brain" if differ else ""
+    differ = [i for i, (row, line) in enumerate(zip(rows, should, strict=True))
+              if row != _values(line)]  # fmt: skip
+    return f"rows {listed(differ)} differ from the brain" if differ else ""
+
+
+def _values(line: str) -> list[str | float]:
+    """Parse a row of a CSV table: numbers where they can be read as such, else text.
+
+    Example:
+        >>> _values("landmark_1,0.50,3")
+        ['landmark_1', 0.5, 3.0]
+    """
+    return [_number_or_text(cell) for cell in line.split(",")]
+
+
+def _number_or_text(cell: str) -> str | float:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
 
 
 def _why(error: Exception) -> str:
@@ -342,11 +299,4 @@ def _why(error: Exception) -> str:
 
 def _row(name: str, rows: np.ndarray) -> str:
     table = name.split(".")[1].removesuffix("_table")
-    return f"{table} {_some(rows)}"
-
-
-def _some(values: Any) -> str:
-    values = list(values.tolist() if hasattr(values, "tolist") else values)
-    shown = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values[:_SHOWN])
-    more = len(values) - _SHOWN
-    return f"{shown} and {more} more" if more > 0 else shown
+    return f"{table} {listed(rows)}"

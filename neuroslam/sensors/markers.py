@@ -6,8 +6,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
+from neuroslam.sensors.frames import check_picture
 
 _SMALL_PX = 480  # narrower pictures are enlarged: the detector needs a few pixels a module
 
@@ -22,6 +23,7 @@ def marker_dictionary(name: str) -> "cv2.aruco.Dictionary":
     if name.upper() not in {key.upper() for key in known}:
         raise SourceError(
             f"markers {name!r}: no such dictionary; expected one of {', '.join(sorted(known))}"
+            f"{did_you_mean(name.upper(), known)}"
         )
     key = next(value for short, value in known.items() if short.upper() == name.upper())
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
@@ -69,8 +71,7 @@ class MarkerDetector:
         Args:
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
         """
-        if image.dtype != np.uint8 or image.ndim not in (2, 3):
-            raise BadFrame(f"markers: a picture of {image.dtype} {image.shape}; expected uint8")
+        check_picture(image, "markers")
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         times = max(1, math.ceil(_SMALL_PX / grey.shape[1]))
         if times > 1:

@@ -168,10 +168,10 @@ class _BagTopic(Source):
         """Forget what an earlier reading has left."""
 
     @abstractmethod
-    def _frame(self, index: int, time_s: float, message: Any) -> Frame:
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
         """Make a frame of a message of the first topic."""
 
-    def _also(self, message: Any) -> None:
+    def _also(self, message: Any) -> None:  # noqa: ANN401
         """Take in a message of another topic than the first."""
 
 
@@ -185,7 +185,7 @@ class BagCamera(_BagTopic):
     def _begin(self) -> None:
         self.shape: tuple[int, ...] | None = None
 
-    def _frame(self, index: int, time_s: float, message: Any) -> Frame:
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
         image = _grey(message, self.name, index)
         self.shape = self.shape or image.shape
         require_shape(image, self.shape, self.name, index)
@@ -202,11 +202,11 @@ class BagMotion(_BagTopic):
     def _begin(self) -> None:
         self.ranges: np.ndarray | None = None
 
-    def _also(self, message: Any) -> None:
+    def _also(self, message: Any) -> None:  # noqa: ANN401
         self.ranges = full_turn(message.ranges, message.angle_min, message.angle_increment,
                                 message.range_min, message.range_max)  # fmt: skip
 
-    def _frame(self, index: int, time_s: float, message: Any) -> Frame:
+    def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
         twist = message.twist.twist
         v, w = float(twist.linear.x), float(twist.angular.z)
         if not (np.isfinite(v) and np.isfinite(w)):
@@ -245,13 +245,13 @@ def full_turn(
     return np.where(held, distances[ray.clip(0, len(distances) - 1)], np.inf)
 
 
-def _time_s(message: Any, received_ns: int) -> float:
+def _time_s(message: Any, received_ns: int) -> float:  # noqa: ANN401
     stamp = message.header.stamp
     stamped = stamp.sec + stamp.nanosec * 1e-9
     return stamped if stamped > 0.0 else received_ns * 1e-9
 
 
-def _grey(message: Any, name: str, index: int) -> np.ndarray:
+def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
     if hasattr(message, "format"):
         image = decode_grey(bytes(message.data))
         if image is None:

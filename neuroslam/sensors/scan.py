@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.sensors.frames import checked_array
 
 _WINDOW_M = 0.06  # half the window: in it a corner of 90 degrees shows, and a pillar is still flat
 _WALL_M = 0.25  # half of the most that is fitted of one wall
@@ -88,7 +89,11 @@ def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) 
         >>> walls_in_scan(ahead, reach_m=0.3).round(3).tolist()
         [[0.2, 0.0]]
     """
-    scan = _checked(ranges, reach_m, tolerance_m)
+    if not (reach_m > 0.0 and 0.0 < tolerance_m < np.inf):
+        raise BadFrame(
+            f"scan: reach_m is {reach_m} and tolerance_m is {tolerance_m}; expected both above 0"
+        )
+    scan = checked_ranges(ranges)
     found: list[_Wall] = []
     if scan.min() > reach_m + _OUTLIER * tolerance_m:
         return np.empty((0, 2))
@@ -107,19 +112,32 @@ def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) 
     return np.array(sorted(wall[:2] for wall in found)).reshape(-1, 2)
 
 
-def _checked(ranges: ArrayLike, reach_m: float, tolerance_m: float) -> np.ndarray:
-    scan = np.asarray(ranges, dtype=np.float64)
-    if scan.ndim != 1 or len(scan) < 8:
-        raise BadFrame(f"scan: has the shape {scan.shape}; expected (n,), at least 8 beams")
+def checked_ranges(ranges: object) -> np.ndarray:
+    """Return the ranges of a scan, if a lidar can have measured them.
+
+    Args:
+        ranges: Metres, ``(n,)``; ``inf`` where nothing is in reach.
+
+    Returns:
+        The same, ``float64``.
+
+    Raises:
+        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or holds NaN, negative ranges
+            or no numbers at all.
+
+    Example:
+        >>> checked_ranges([1.0, 2.0])
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: scan: ranges have shape (2,); expected (n,), at least 8 beams
+    """
+    scan = checked_array(ranges, "scan: ranges", (None,), "metres of at least 8 beams")
+    if len(scan) < 8:
+        raise BadFrame(f"scan: ranges have shape {scan.shape}; expected (n,), at least 8 beams")
     if not scan.min() >= 0.0:  # NaN too
         at = int(np.flatnonzero(~(scan >= 0.0))[0])
         raise BadFrame(
             f"scan: beam {at} measures {scan[at]:g} m; expected metres, at least 0, or inf where "
             "nothing is in reach"
-        )
-    if not (reach_m > 0.0 and 0.0 < tolerance_m < np.inf):
-        raise BadFrame(
-            f"scan: reach_m is {reach_m} and tolerance_m is {tolerance_m}; expected both above 0"
         )
     return scan
 

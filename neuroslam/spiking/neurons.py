@@ -97,7 +97,7 @@ def lif_step(
     return LIFState(threshold(deficit, 0.0, 1.0).clamp_max_(1.0), asleep), fired
 
 
-def lif_rate(current: Tensor, membrane: Membrane = Membrane()) -> Tensor:
+def lif_rate(current: Tensor, membrane: Membrane = Membrane()) -> Tensor:  # noqa: B008 - immutable
     r"""Return the rate at which a neuron fires under a constant current, in Hz.
 
     .. math:: a(J) = \frac{1}{\tau_{ref} + \tau_{rc} \log(1 + 1/(J - 1))}, \quad J > 1

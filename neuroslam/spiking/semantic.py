@@ -1,7 +1,7 @@
 """The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, Self
 
 import numpy as np
@@ -24,7 +24,7 @@ from neuroslam.spiking.sightings import (
     LandmarkUpdate,
     Sightings,
 )
-from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.slam import SSPSLAM, SSPStep
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, without_gradients
@@ -128,6 +128,7 @@ class SemanticCells(Population):
             told=-1,  # landmark that has told where the robot is, in this turn of attention
         )
         self.slam.start(torch.zeros(1, 2))
+        self.watch: Callable[[int, SSPStep], None] | None = None  # a recorder's, of each step
         self._rows: dict[tuple[int, int], int] = {}
         self.register_load_state_dict_pre_hook(_take_pointers)
         self.register_load_state_dict_post_hook(lambda module, _: module._index())
@@ -135,10 +136,10 @@ class SemanticCells(Population):
     @property
     def n(self) -> int:
         """Number of landmarks that count: seen more than a time or two."""
-        return int(self._counts().sum())
+        return int(self.confirmed().sum())
 
-    def _counts(self) -> Tensor:
-        """Tell which landmarks were seen so often that they are none by mistake."""
+    def confirmed(self) -> Tensor:
+        """Tell of each row of ``known`` whether it was seen so often that it is no mistake."""
         return (self.known["seen"] >= LEAST_SEEN) | (self.known["kind"] == VIEW)
 
     @property
@@ -149,7 +150,7 @@ class SemanticCells(Population):
 
     def landmarks(self) -> dict[str, np.ndarray]:
         """Return the columns of the landmarks that count, and their names."""
-        rows = self._counts()
+        rows = self.confirmed()
         columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
         both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
         return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
@@ -262,7 +263,9 @@ class SemanticCells(Population):
         columns = ("name", "place_m", "seen", "first_frame", "experience")
         rows = zip(*(known[column].tolist() for column in columns), strict=True)
         lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e in rows]
-        return {"landmarks.csv": "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines, ""])}
+        return {
+            "landmarks.csv": "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines, ""])
+        }
 
     def points_m(self) -> np.ndarray:
         """Return where landmarks are on the map, ``(n, 2)``, views left out."""
@@ -503,7 +506,7 @@ class SemanticCells(Population):
         low = np.tile(low, (steps, 1, 1, 1))
         view = LandmarkView(in_view, distance, low, low, np.arange(n))
         velocity = torch.tensor(step_m) / (steps * dt)
-        said = slam.run(velocity.expand(steps, 1, 2), view)
+        said = slam.run(velocity.expand(steps, 1, 2), view, self.watch)
         recall, gate, lost, attended = (
             part[-1, 0].item() for part in (said.recall, said.gate, said.lost, said.attended)
         )

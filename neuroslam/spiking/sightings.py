@@ -5,9 +5,12 @@ from typing import NamedTuple
 import numpy as np
 
 from neuroslam.errors import BadFrame
+from neuroslam.sensors.frames import checked_array
 
 NAMED, VIEW, NAMELESS = 0, 1, 2
 """Kinds of landmarks: with a number of its own, a known view, told apart by place alone."""
+
+_LARGEST_NUMBER = 2.0**53  # from there on not every whole number is a float64
 
 LEAST_SEEN = 3
 """Times that a landmark was seen, before it counts: outliers are seen once."""
@@ -41,15 +44,7 @@ class Sightings(NamedTuple):
             >>> Sightings.of(np.array([[7.0, 2.0, 0.1]])).with_view(3).kind.tolist()
             [0, 1]
         """
-        tables = tuple(np.asarray(rows, dtype=np.float64) for rows in tables)
-        for rows in tables:
-            if rows.ndim != 2 or rows.shape[1] != 3:
-                raise BadFrame(
-                    f"landmarks have shape {rows.shape}; expected (n, 3): number, distance, bearing"
-                )
-        rows = np.concatenate((np.empty((0, 3)), *tables))
-        if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
-            raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
+        rows = np.concatenate((np.empty((0, 3)), *map(checked_landmarks, tables)))
         first = np.unique(rows[:, 0], return_index=True)[1]
         once = rows[:, 0] < 0  # nameless ones are told apart by their places
         once[first] = True
@@ -61,6 +56,37 @@ class Sightings(NamedTuple):
         """Add a known view: a landmark at which the robot stands when it sees it."""
         row = (VIEW, view, 0.0, 0.0)
         return Sightings(*(np.append(column, x) for column, x in zip(self, row, strict=True)))
+
+
+def checked_landmarks(landmarks: object) -> np.ndarray:
+    """Return the landmarks of a frame, if a sensor can have seen them.
+
+    Args:
+        landmarks: Number (below 0: it has no name), distance (m) and bearing (rad) of each,
+            ``(n, 3)``.
+
+    Returns:
+        The same, ``float64``.
+
+    Raises:
+        BadFrame: If they have another shape or type, a distance is negative, a number is not
+            whole, or something is not finite.
+
+    Example:
+        >>> checked_landmarks([[1.5, 2.0, 0.1]])  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: a landmark has the number 1.5; expected a whole number below ...
+    """
+    rows = checked_array(landmarks, "landmarks", (None, 3), "number, distance, bearing")
+    if not np.isfinite(rows).all() or (rows[:, 1] < 0).any():
+        raise BadFrame("a landmark's distance or bearing is negative or not a number; drop it")
+    number = rows[:, 0]
+    wrong = np.flatnonzero((number != np.floor(number)) | (np.abs(number) >= _LARGEST_NUMBER))
+    if len(wrong):
+        raise BadFrame(
+            f"a landmark has the number {number[wrong[0]]:g}; expected a whole number below 2**53"
+        )
+    return rows
 
 
 class LandmarkUpdate(NamedTuple):

@@ -96,7 +96,7 @@ def without_gradients(step: Callable[P, T]) -> Callable[P, T]:
 
 
 def about_now(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
-    """Keep the value of the session that goes on: it is about the present, and nothing is learnt."""
+    """Keep the value of the session that goes on: it is about the present, not learnt."""
     return partial
 
 
@@ -176,9 +176,7 @@ def rule_of(name: str, rules: Mapping[str, Rule]) -> Rule | None:
     return rules.get(name) or rules.get(name.partition(".")[0])
 
 
-def merge_by_rules(
-    rules: Mapping[str, Rule], loaded: State, partial: State, join: Join
-) -> State:
+def merge_by_rules(rules: Mapping[str, Rule], loaded: State, partial: State, join: Join) -> State:
     """Merge every tensor by its rule.
 
     Raises:

@@ -23,6 +23,10 @@ Observation = Any
 """What a population finds in a frame: arrays, numbers or a tuple of them; ``None``: nothing."""
 
 
+Picture = np.ndarray | tuple[np.ndarray, ...]
+"""Activity, ``(h, w)`` of any scale, or layers side by side; or ``uint8``, ``(h, w, 3)``."""
+
+
 class StepInput(NamedTuple):
     """What every population gets of a frame.
 
@@ -238,7 +242,7 @@ class Population(Mergeable):
         raise NotImplementedError(f"{type(self).__name__} cannot lead")
 
     @property
-    def estimate(self) -> Any:
+    def estimate(self) -> Any:  # noqa: ANN401 - of a batch it is a tensor
         """Where the cells have the robot: columns ``pose_x``, ``pose_y``, ``pose_theta``."""
         raise NotImplementedError(f"{type(self).__name__} cannot lead")
 
@@ -262,11 +266,8 @@ class Population(Mergeable):
         """Return curves of TensorBoard: a value now for each tag."""
         return {}
 
-    def images(self) -> dict[str, np.ndarray]:
-        """Return pictures for TensorBoard, plots and the report.
-
-        Each is activity, ``(h, w)`` of any scale, which is coloured, or ``uint8``, ``(h, w, 3)``.
-        """
+    def images(self) -> dict[str, Picture]:
+        """Return pictures of TensorBoard, plots and the report, by tag."""
         return {}
 
     def tables(self) -> dict[str, str]:
@@ -319,19 +320,30 @@ class Population(Mergeable):
 
 
 class LeadableMap(Protocol):
-    """What a leader uses of the experience map."""
+    """What a leader uses of :class:`~neuroslam.mapping.experience.ExperienceMap`."""
 
     @property
-    def n(self) -> int: ...
+    def n(self) -> int:
+        """Number of experiences."""
+
     @property
-    def current(self) -> int: ...
+    def current(self) -> int:
+        """Id of the experience the robot is at, -1 before the first."""
+
     @property
-    def pose(self) -> Pose: ...
+    def pose(self) -> Pose:
+        """Pose of the robot."""
+
     @property
-    def pose_table(self) -> np.ndarray: ...
+    def pose_table(self) -> np.ndarray:
+        """Poses of all experiences, ``(n, 3)``, to read only."""
+
     def visit(
         self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None
-    ) -> tuple[Action, int]: ...
+    ) -> tuple[Action, int]:
+        """Go to an experience by position."""
+
     def __call__(
         self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int, *, carried: bool
-    ) -> tuple[Action, int]: ...
+    ) -> tuple[Action, int]:
+        """Integrate odometry, and go to an experience by view."""

@@ -85,8 +85,7 @@ def _check_merges(cls: type[Population]) -> None:
         merged = one.merged(loaded, partial, Join.nothing())
     except (MapError, RuntimeError, ValueError, KeyError, IndexError, TypeError) as error:
         raise ConfigError(
-            f"{what}: two states without experience do not merge "
-            f"({type(error).__name__}: {error})"
+            f"{what}: two states without experience do not merge ({type(error).__name__}: {error})"
         ) from error
     if merged.keys() != partial.keys():
         odd = ", ".join(sorted(merged.keys() ^ partial.keys()))

@@ -98,6 +98,9 @@ class Scalars(nn.Module):
 
     A tensor operation on a single number costs microseconds; a Python one does not.
 
+    Raises:
+        ValueError: If a name would hide one of ``nn.Module``.
+
     Example:
         >>> state = Scalars(frame=0, heading_rad=0.5)
         >>> state.frame += 1
@@ -107,6 +110,9 @@ class Scalars(nn.Module):
 
     def __init__(self, **values: float) -> None:
         super().__init__()
+        hidden = [name for name in values if hasattr(self, name)]
+        if hidden:
+            raise ValueError(f"Scalars: {hidden[0]!r} is a name of nn.Module; take another")
         self.kinds = {name: type(value) for name, value in values.items()}
         for name, value in values.items():
             setattr(self, name, value)

@@ -18,6 +18,7 @@ from neuroslam.figures.tuning import plot_tuning
 from neuroslam.runs.files import write_text
 from neuroslam.runs.parallel import one_thread
 from neuroslam.sensors import Source, open_source
+from neuroslam.state.registry import leading_class
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
@@ -152,7 +153,7 @@ def tune(
         RunError: If the source is live, the brain has no pose cells, or ``out`` cannot be written.
     """
     out, config = Path(out), config or BrainConfig()
-    if not config.has("pose"):
+    if not leading_class(config).needs_views:
         raise RunError(f"cells are {'+'.join(config.cells)}; tuning is of views, which needs pose")
     if stop is not None and stop < 1:
         raise RunError(f"stop is {stop}; expected 1 or more")

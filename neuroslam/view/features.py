@@ -19,9 +19,10 @@ from torch.nn.functional import interpolate, pad
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.sensors.frames import check_picture
 from neuroslam.state.files import first_line, tensors_digest
 from neuroslam.view import vision
-from neuroslam.view.preprocess import Encoded, check_picture, crop, encode
+from neuroslam.view.preprocess import Encoded, crop, encode
 
 Encoder = Callable[[np.ndarray], Encoded]
 """Makes the template of a picture."""
@@ -109,7 +110,7 @@ class FeatureEncoder:
             BadFrame: If the picture is of another type or shape, or its features not finite.
             ConfigError: If the crop leaves the picture, or the network gives no features.
         """
-        check_picture(image)
+        check_picture(image, "LocalViewCells")
         config = self.config
         image = crop(image, config.crop)
         rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)

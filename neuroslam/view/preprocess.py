@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 
 from neuroslam.config import ViewConfig
-from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.errors import ConfigError
+from neuroslam.sensors.frames import check_picture
 
 
 class Encoded(NamedTuple):
@@ -41,7 +42,7 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         >>> (encode(picture, config).template[0] * 255).tolist()
         [4.5, 6.5, 8.5, 10.5]
     """
-    check_picture(image)
+    check_picture(image, "LocalViewCells")
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
@@ -51,19 +52,6 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
     if config.patch_radius:
         view = normalise_patches(view, config.patch_radius, config.patch_min_std)
     return Encoded(view, contrast)
-
-
-def check_picture(image: np.ndarray) -> None:
-    """Check that a picture is ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-
-    Raises:
-        BadFrame: If it is of another type or shape.
-    """
-    if image.dtype != np.uint8 or (image.ndim != 2 and image.shape[2:] != (3,)):
-        raise BadFrame(
-            f"LocalViewCells: picture is {image.dtype} {image.shape}; "
-            "expected uint8, (h, w) or (h, w, 3)"
-        )
 
 
 def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:

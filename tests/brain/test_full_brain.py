@@ -232,6 +232,112 @@ def test_what_no_landmark_can_be_is_refused_and_changes_nothing(rows, said, driv
     assert all(torch.equal(before[name], value) for name, value in brain.state_dict().items())
 
 
+WRONG = {
+    "walls of 3 columns": ({"walls": np.ones((4, 3))}, "walls have shape (4, 3); expected (n, 2)"),
+    "walls of 1 row": ({"walls": np.ones(2)}, "walls have shape (2,); expected (n, 2)"),
+    "walls on end": ({"walls": np.ones((2, 5))}, "walls have shape (2, 5); expected (n, 2)"),
+    "walls of batches": ({"walls": np.ones((1, 4, 2))}, "walls have shape (1, 4, 2); expected"),
+    "one wall": ({"walls": 0.5}, "walls have shape (); expected (n, 2)"),
+    "text walls": ({"walls": np.array([["1", "2"]])}, "walls are an array of text of shape (1, 2)"),
+    "object walls": ({"walls": np.array([[None, 1]])}, "walls are an array of objects of shape"),
+    "complex walls": ({"walls": np.ones((1, 2), complex)}, "walls are an array of complex"),
+    "true walls": ({"walls": np.ones((1, 2), bool)}, "walls are an array of booleans"),
+    "ragged walls": ({"walls": [[1.0, 2.0], [1.0]]}, "walls are of type list; expected numbers"),
+    "dict of walls": ({"walls": {"left": 1.0}}, "walls are of type dict; expected numbers of sh"),
+    "square scan": (
+        {"walls": None, "ranges": np.ones((36, 1))},
+        "scan: ranges have shape (36, 1); expected (n,)",
+    ),
+    "text scan": (
+        {"walls": None, "ranges": ["1"] * 36},
+        "scan: ranges are an array of text of shape (36,); expected numbers of shape (n,)",
+    ),
+    "short scan": ({"walls": None, "ranges": []}, "scan: ranges have shape (0,); expected (n,)"),
+    "flat landmarks": ({"landmarks": np.ones(3)}, "landmarks have shape (3,); expected (n, 3)"),
+    "text landmarks": ({"landmarks": [["1", "2", "3"]]}, "landmarks are an array of text of"),
+    "landmark 1.5": ({"landmarks": [[1.5, 2, 0]]}, "a landmark has the number 1.5; expected a"),
+    "landmark 1e300": ({"landmarks": [[1e300, 2, 0]]}, "a landmark has the number 1e+300; exp"),
+    "heading of text": ({"heading_rad": "north"}, "heading is 'north'; expected a number, in rad"),
+    "two headings": ({"heading_rad": np.ones(2)}, "heading is an array of float64 of shape (2,)"),
+    "tensor as heading": (
+        {"heading_rad": torch.tensor(0.1)},
+        "heading is an array of torch.float32 of shape (); expected a number, in rad",
+    ),
+    "one heading": ({"heading_rad": [0.1]}, "heading is of type list; expected a number, in rad"),
+    "huge heading": ({"heading_rad": 10**400}, "heading inf rad; expected a finite number"),
+    "speed alone": ({"velocity": 0.5}, "odometry is 0.5; expected speed (m/s) and turn rate"),
+    "three speeds": ({"velocity": (1.0, 0.0, 0.0)}, "odometry is of type tuple; expected speed"),
+    "text speed": ({"velocity": ("1", "0")}, "odometry is of type tuple; expected speed (m/s)"),
+    "no turn rate": ({"velocity": Velocity(1.0, None)}, "odometry is of type Velocity; expected"),
+    "float image": ({"image": np.ones((40, 64))}, "picture is float64 (40, 64); expected uint8"),
+    "image with alpha": (
+        {"image": np.ones((40, 64, 4), np.uint8)},
+        "picture is uint8 (40, 64, 4); expected uint8, (h, w) or (h, w, 3)",
+    ),
+    "no pixels": ({"image": np.ones((0, 64), np.uint8)}, "picture is uint8 (0, 64); expected"),
+    "list as image": ({"image": [[0, 1]]}, "picture is of type list, no array of numpy; expected"),
+    "file as image": ({"image": "a.png"}, "picture is 'a.png', no array of numpy; expected uint8"),
+    "tensor as image": (
+        {"image": torch.zeros(40, 64, dtype=torch.uint8)},
+        "picture is an array of torch.uint8 of shape (40, 64), no array of numpy; expected",
+    ),
+    "time of text": ({"time_s": "noon"}, "its time is 'noon'; expected a number, in s"),
+    "no time": ({"time_s": None}, "its time is None; expected a number, in s"),
+    "index": ({"index": 10.0}, "its index is 10.0; expected a whole number of 64 bits"),
+    "large index": ({"index": 2**63}, "its index is 9223372036854775808; expected a whole"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_frame_of_wrong_shapes_or_types_is_one_line_and_changes_nothing(kind, drive):
+    change, said = WRONG[kind]
+    brain = lives(brain_of(), drive[:10])
+    before = {name: value.clone() for name, value in brain.state_dict().items()}
+    with pytest.raises(BadFrame) as caught:
+        brain(drive[10]._replace(**change))
+    assert said in str(caught.value)
+    assert str(caught.value).startswith(f"frame {change.get('index', 10)}: ")
+    assert "\n" not in str(caught.value)
+    assert all(torch.equal(before[name], value) for name, value in brain.state_dict().items())
+    brain(drive[10])
+
+
+@pytest.mark.parametrize("kind", ["time of text", "index"])
+def test_the_first_frame_is_checked_like_all_others(kind, drive):
+    change, said = WRONG[kind]
+    brain = brain_of()
+    for wrong, told in ((change, said), ({"time_s": math.nan}, "time nan s; times must rise")):
+        with pytest.raises(BadFrame) as caught:
+            brain(drive[0]._replace(**wrong))
+        assert told in str(caught.value)
+    brain(drive[0])
+    assert brain.clock.frames_seen == 1
+
+
+def test_lists_and_numbers_of_other_types_say_the_same_as_arrays(drive):
+    frame = drive[5]
+    same = frame._replace(
+        walls=None,
+        landmarks=frame.landmarks.tolist(),
+        ranges=frame.ranges.tolist(),
+        heading_rad=np.array(frame.heading_rad),
+        velocity=np.array(frame.velocity),
+        index=np.int32(frame.index),
+        time_s=np.float64(frame.time_s),
+    )
+    brains = [lives(brain_of(), drive[:5]) for _ in range(2)]
+    for brain, one in zip(brains, (frame._replace(walls=None), same), strict=True):
+        brain(one)
+    assert equal_states(*brains) == []
+
+
+def test_no_walls_and_no_landmarks_may_be_empty_lists(drive):
+    brains = [lives(brain_of(), drive[:5]) for _ in range(2)]
+    brains[0](drive[5]._replace(walls=[], landmarks=[]))
+    brains[1](drive[5]._replace(walls=np.empty((0, 2)), landmarks=np.empty((0, 3))))
+    assert equal_states(*brains) == []
+
+
 def test_who_leaves_the_space_is_told_what_to_raise():
     brain = brain_of("semantic", semantic={"space": {"reach_m": 2.0}})
     with pytest.raises(MapError, match=r"outside of its space of \+-2 m; raise semantic.space"):

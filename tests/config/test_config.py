@@ -5,8 +5,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
+from neuroslam.cells import NavigationCells
 from neuroslam.config import (
     CLASSIC_NAMES,
     BrainConfig,
@@ -18,6 +19,8 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
+from neuroslam.config.sections import GridCellConfig, PoseCellConfig, ViewConfig
+from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import ConfigError
 from neuroslam.runs.run import resolve_config
 
@@ -51,12 +54,75 @@ def test_the_presets_the_data_need_are_there():
         ({"view": {"crop": [0, 1, 2]}}, r"view\.crop = .*expected four whole numbers x_min"),
         ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
         ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
+        ({"map": {"solver": "relx"}}, r"map.solver = 'relx': .*; did you mean 'relax'\?$"),
+        ({"cells": "pose+plase"}, r"cells = 'plase': .*; did you mean 'place'\?$"),
+        ({"veiw": {}}, r"config: unknown key 'veiw'; did you mean 'view'\?$"),
+        ({"view": {"n_xy": 9}}, r"unknown key 'view\.n_xy'; did you mean 'pose_cells\.n_xy'\?$"),
+        (
+            {"view": {"threshold": 2}, "semantic": {"space": {"reach": 3.0}}},
+            r"key 'semantic\.space\.reach'; did you mean 'semantic\.space\.reach_m'\?$",
+        ),
+        (
+            {"sigma_m": 0.1},
+            r"'sigma_m'; did you mean 'map\.sigma_m' or 'boundary_cells\.sigma_m' or "
+            r"'wall_memory\.sigma_m'\?$",
+        ),
+        ({"view": {"{0}": 1}}, r"unknown key 'view\.\{0\}'"),
+        ({"view": {"features": "gray"}}, r"features gray needs weights: .*; did you mean 'grey'\?"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line(values, message):
     with pytest.raises(ConfigError, match=message) as caught:
         build_config(values)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "where", "said"),
+    [
+        (
+            lambda: BrainConfig(veiw={}),
+            ("veiw",),
+            "unknown key 'veiw'; did you mean 'view'?",
+        ),
+        (
+            lambda: BrainConfig(view={"treshold": 0.1}),
+            ("view", "treshold"),
+            "unknown key 'view.treshold'; did you mean 'view.threshold'?",
+        ),
+        (
+            lambda: PoseCellConfig(n_xz=3),
+            ("n_xz",),
+            "unknown key 'n_xz'; did you mean 'n_xy'?",
+        ),
+        (
+            lambda: BrainConfig(semantic={"space": {"reach": 3.0}}),
+            ("semantic", "space", "reach"),
+            "unknown key 'semantic.space.reach'; did you mean 'semantic.space.reach_m'?",
+        ),
+        (
+            lambda: BrainConfig(semantic={"tier": "spikin"}),
+            ("semantic", "tier"),
+            "Input should be 'algebraic', 'rate' or 'spiking'; did you mean 'spiking'?",
+        ),
+        (lambda: PoseCellConfig(mood="fine"), ("mood",), "unknown key 'mood'"),
+    ],
+)
+def test_a_config_made_in_python_says_what_was_meant(make, where, said):
+    with pytest.raises(ValidationError) as caught:
+        make()
+    [error] = caught.value.errors()
+    assert (error["loc"], error["msg"]) == (where, said)
+
+
+def test_what_else_is_wrong_is_told_after_unknown_keys():
+    with pytest.raises(ValidationError) as caught:
+        BrainConfig(view={"threshold": 2}, map={"solver": "relx"}, threads=0, cels="pose")
+    errors = caught.value.errors()
+    assert [error["type"] for error in errors] == [
+        "unknown_key", "less_than", "literal_error", "greater_than_equal",
+    ]  # fmt: skip
+    assert caught.value.title == "BrainConfig"
 
 
 def test_a_config_cannot_be_changed_after_it_was_checked():
@@ -78,6 +144,84 @@ def test_assignments_read_toml_values():
     assert parse_assignment("map.solver=least_squares") == {"map": {"solver": "least_squares"}}
     with pytest.raises(ConfigError, match=r"expected section\.key=value"):
         parse_assignment("nonsense")
+
+
+# --- parameters that must agree -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spacings_m", "orientations_deg"),
+    [
+        ((0.25,), (0.0,)),
+        ((0.5, 0.7), (0.0, 15.0)),
+        ((0.35, 0.46, 0.6, 0.78), (0.0, 15.0, -10.0, 7.0)),
+        # 60 / 1.618 = 37.08 degrees, times 4, 5 and 6, wrapped to [-30, 30)
+        ((0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), (0.0, 15.0, -10.0, 7.0, 28.3, 5.4, -17.5)),
+    ],
+)
+def test_orientations_follow_the_number_of_spacings(spacings_m, orientations_deg):
+    config = BrainConfig(grid_cells={"spacings_m": spacings_m})
+    assert config.grid_cells.orientations_deg == orientations_deg
+    assert build_config(tomllib.loads(to_toml(config))) == config
+    assert build_config({"grid_cells": {"spacings_m": list(spacings_m)}}) == config
+
+
+@pytest.mark.parametrize(
+    ("orientations_deg", "spacings_m"),
+    [
+        ((5.0,), (0.35,)),
+        ((5.0, 6.0, 7.0), (0.35, 0.46, 0.6)),
+        ((1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (0.35, 0.46, 0.6, 0.78, 1.01, 1.31)),
+    ],
+)
+def test_spacings_follow_the_number_of_orientations(orientations_deg, spacings_m):
+    config = GridCellConfig(orientations_deg=orientations_deg)
+    assert config.spacings_m == spacings_m
+    assert config.orientations_deg == orientations_deg
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"spacings_m": [0.3], "orientations_deg": [0.0, 15.0]},
+            "spacings_m has 1 modules, orientations_deg 2; expected the same, or only one of the",
+        ),
+        ({"orientations_deg": []}, "spacings_m has 1 modules, orientations_deg 0"),
+        ({"spacings_m": []}, r"spacings_m = \[\]: tuple should have at least 1 item"),
+        ({"spacings_m": 0.3}, r"spacings_m = 0\.3: input should be a valid tuple"),
+        ({"spacings_m": "0.3"}, r"spacings_m = '0\.3': input should be a valid tuple"),
+        ({"spacings_m": [-0.3]}, r"spacings_m has -0\.3; expected more than 0"),
+    ],
+)
+def test_grid_modules_that_do_not_agree_are_one_line(values, message):
+    with pytest.raises(ConfigError, match=message):
+        build_config({"grid_cells": values})
+
+
+def test_cells_live_with_one_spacing_given():
+    cells = NavigationCells(BrainConfig(grid_cells={"spacings_m": (0.25,), "n_cells": 4}))
+    assert cells.grid.rates.shape == (1, 4)
+
+
+@pytest.mark.parametrize(("width", "shift"), [(2, 0), (5, 2), (8, 3), (9, 4), (60, 4)])
+def test_the_shift_follows_a_narrow_template(width, shift):
+    assert ViewConfig(template_width=width).shift_match == shift
+    with pytest.raises(ValidationError, match="leaves no column"):
+        ViewConfig(template_width=width, shift_match=(width + 1) // 2)
+
+
+def test_the_dimension_follows_scales_that_are_given_for_each():
+    assert SSPSpaceConfig(reach_m=(1.0, 2.0, 3.0)).dimension == 3
+    assert SSPSpaceConfig(length_scale_m=(0.2, 0.3, 0.4), reach_m=(1.0, 2.0, 3.0)).dimension == 3
+    assert SSPSpaceConfig(reach_m=2.0).dimension == 2
+    with pytest.raises(ValidationError, match="one number or 2 of them"):
+        SSPSpaceConfig(dimension=2, reach_m=(1.0, 2.0, 3.0))
+    with pytest.raises(ConfigError, match=r"space.dimension is 3; a brain lives in 2"):
+        build_config({"semantic": {"space": {"reach_m": [1.0, 2.0, 3.0]}}})
+
+
+# --- files --------------------------------------------------------------------------------------
 
 
 def test_openratslam_files_are_read(shared):
@@ -104,6 +248,11 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
     ("name", "text", "message"),
     [
         ("a.ini", "[ratslam]\nvt_match_treshold=1\n", "unknown key 'vt_match_treshold'.*did you"),
+        (
+            "a.ini",
+            "[ratslam]\nvrot_image_xmin=1\n",
+            "key 'vrot_image_xmin' in .*did you mean 'vrot_image_x_min'",
+        ),
         ("a.ini", "[ratslam]\nvt_match_threshold=x\n", "expected a number"),
         ("a.ini", "no section\n", "not an OpenRatSLAM file"),
         ("a.ini", "[ratslam]\nimage_crop_x_min=1\n", "image_crop_x_max is missing"),
@@ -122,6 +271,8 @@ def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
 def test_missing_files_and_presets_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         read_config_file(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match=r"no such file; rc_car is a preset, --preset rc_car$"):
+        read_config_file(Path("rc_car"))
     with pytest.raises(ConfigError, match=r"unknown preset 'rc_cart'.*did you mean 'rc_car'"):
         read_preset("rc_cart")
 

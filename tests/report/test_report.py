@@ -448,6 +448,8 @@ def test_a_page_replaces_neither_a_folder_nor_a_file_of_the_run(runs, tmp_path, 
     before = brain.read_bytes()
     assert "is a file of the run" in mistake("report", runs / "a", "-o", brain)
     assert brain.read_bytes() == before
+    landmarks = runs / "a" / "landmarks.csv"
+    assert "is a file of the run" in mistake("report", runs / "a", "-o", landmarks)
     assert "is a folder" in mistake("report", runs / "a", "-o", tmp_path)
     assert "cannot be written" in mistake("report", runs / "a", "-o", brain / "page.html")
     assert "--pictures nan" in mistake("report", runs / "a", "--pictures", "nan")

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
-from neuroslam.config import BrainConfig
+from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import CheckpointError
 from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, experiences_csv, links_csv
 from neuroslam.runs.inspect import inspect
@@ -69,6 +69,14 @@ def damaged(file, to, alter) -> list[str]:
     alter(state)
     save(config, state, to)
     return verify(to)
+
+
+@pytest.fixture(scope="module")
+def folder_with_landmarks(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "run"
+    source = f"{CORRIDOR}&ranges=36&markers=12&landmark_reach=6"
+    run(source, out, build_config(read_preset("full")), stop=40, tensorboard=False)
+    return out
 
 
 def test_a_healthy_brain_has_no_faults(joined, folder):
@@ -398,6 +406,45 @@ def test_files_that_disagree_with_the_brain_are_named(kind, folder, tmp_path):
     [fault] = verify(out)
     assert expected in fault
     assert str(out) in fault
+
+
+def test_a_run_with_landmarks_has_no_faults(folder_with_landmarks):
+    rows = (folder_with_landmarks / "landmarks.csv").read_text().splitlines()[1:]
+    assert len(rows) >= 4  # there is something to compare
+    assert verify(folder_with_landmarks) == []
+
+
+def change(row, column, to):
+    """Change a value of a row of landmarks.csv."""
+
+    def alter(lines):
+        cells = lines[row].rstrip("\n").split(",")
+        cells[column] = to(cells[column])
+        lines[row] = ",".join(cells) + "\n"
+
+    return alter
+
+
+LANDMARK_DAMAGE = {
+    "name": (change(2, 0, lambda _: "landmark_99"), "rows 1 differ from the brain"),
+    "place": (change(2, 1, lambda x: repr(float(x) + 1e-12)), "rows 1 differ from the brain"),
+    "no number": (change(2, 1, lambda _: "far"), "cannot be read (could not convert string to"),
+    "no row": (lambda lines: lines.pop(), "rows, the brain has "),
+    "no value": (
+        lambda lines: lines.__setitem__(1, "landmark_0,1.0\n"),
+        "cannot be read (a row has 2 values, expected 6)",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", LANDMARK_DAMAGE)
+def test_landmarks_that_disagree_with_the_brain_are_named(kind, folder_with_landmarks, tmp_path):
+    alter, expected = LANDMARK_DAMAGE[kind]
+    out = shutil.copytree(folder_with_landmarks, tmp_path / "run")
+    edit("landmarks.csv", alter)(out)
+    [fault] = verify(out)
+    assert fault.startswith(f"{out / 'landmarks.csv'}: ")
+    assert expected in fault
 
 
 def test_a_folder_of_merged_maps_has_no_frames(joined, tmp_path):

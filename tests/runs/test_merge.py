@@ -257,6 +257,13 @@ def test_a_refused_merge_leaves_an_earlier_run_as_it_was(runs, merged, tmp_path,
     assert contents(out) == before
 
 
+def test_a_merge_leaves_no_landmarks_of_an_earlier_run(runs, merged, tmp_path, call):
+    out = shutil.copytree(merged, tmp_path / "out")
+    (out / "landmarks.csv").write_text("name,x_m,y_m,seen,first_frame,experience\n")
+    assert call("merge", runs / "a", runs / "b", "-o", out, "--overwrite").code == 0
+    assert not (out / "landmarks.csv").exists()  # the merged map has no semantic cells
+
+
 def test_maps_of_different_configs_are_refused_and_the_keys_named(runs, tmp_path, call):
     done = call("merge", runs / "a", runs / "other", "-o", tmp_path / "out")
     assert done.code == 3

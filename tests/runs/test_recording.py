@@ -3,11 +3,12 @@ import io
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.config import BrainConfig, build_config, read_preset
+from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
 from neuroslam.errors import RunError
 from neuroslam.runs.recording import (
     NullRecorder,
@@ -148,6 +149,79 @@ def test_a_brain_of_boundary_grid_and_place_cells_is_recorded_too(tmp_path):
             np.frombuffer(events.Images(tag)[-1].encoded_image_string, np.uint8), cv2.IMREAD_COLOR
         )
         assert picture.std() > 10.0  # something is drawn
+
+
+LANDMARKS = (
+    "world:corridor?width=64&height=40&noise=0.02&compass_deg=2&markers=12&landmark_reach=6"
+    "&frames_per_lap=170&laps=1"
+)
+
+
+def semantic_drive(folder, n, before_each=lambda i, brain: None, **over):
+    """A drive past landmarks that is recorded; the brain, its results, and the events."""
+    config = merge_values(read_preset("full"), {"cells": "pose+semantic", **over})
+    brain, results = NavigationBrain(build_config(config)), []
+    with TensorBoardRecorder(folder, scalars_every=5, maps_every=20) as recorder:
+        for i, frame in enumerate(open_source(LANDMARKS).frames(0, n)):
+            before_each(i, brain)
+            results.append(brain(frame))
+            recorder.step(results[-1], frame, brain)
+        assert brain.semantic.watch is not None
+    events = EventAccumulator(str(folder), {"images": 0, "scalars": 0, "histograms": 0})
+    events.Reload()
+    return brain, results, events
+
+
+def test_a_brain_with_a_semantic_map_is_recorded_too(tmp_path):
+    brain, _, events = semantic_drive(tmp_path, 47)
+    tags = events.Tags()
+    assert brain.semantic.n >= 3
+    assert "ssp/map" in tags["images"]
+    assert "ssp/spikes" not in tags["images"]  # vectors do not spike
+    # After the first frame the recorder is told of every step, and writes every fifth frame.
+    for tag in ("ssp/recall", "ssp/agreement", "ssp/gate", "ssp/lost"):
+        assert [point.step for point in events.Scalars(tag)] == list(range(5, 47, 5))
+    assert 0.5 < max(point.value for point in events.Scalars("ssp/recall")) < 1.5
+    # As rarely as the panels of other cells, and at the end.
+    assert [drawn.step for drawn in events.Images("ssp/map")] == [20, 40, 46]
+    assert min(pixels(events.Images("ssp/map")[-1]).shape[:2]) >= 500
+    assert brain.semantic.watch is None  # nothing is told of a run that is closed
+
+
+def test_the_spikes_of_a_semantic_map_are_recorded(tmp_path):
+    spiking = {
+        "tier": "spiking", "time_step_s": 0.001, "binding": "exact", "vector_neurons": 0,
+        "space": {"n_rotations": 1, "n_scales": 1}, "integrator": {"neurons": 50},
+        "map": {"neurons": 60}, "key_features": 16,
+    }  # fmt: skip
+    _, _, events = semantic_drive(tmp_path, 8, semantic=spiking)
+    tags = events.Tags()
+    assert {"ssp/spikes", "ssp/map"} <= set(tags["images"])
+    assert {"ssp_rate_hz/integrator", "ssp_rate_hz/map.memory"} <= set(tags["scalars"])
+    assert "ssp_rates_hz/integrator" in tags["histograms"]
+    assert 10 < events.Scalars("ssp_rate_hz/integrator")[-1].value < 400
+
+
+def test_the_panels_follow_a_brain_that_starts_a_new_map(tmp_path):
+    before = []
+
+    def carried(i, brain):
+        if i == 12:
+            before.append(brain.semantic)
+            brain.start_new_map()
+            assert brain.semantic is not before[0]
+
+    brain, _, events = semantic_drive(tmp_path, 20, carried)
+    assert [point.step for point in events.Scalars("ssp/recall")] == [5, 10, 15]
+    assert (before[0].watch, brain.semantic.watch) == (None, None)
+
+
+def test_recording_a_semantic_map_does_not_change_it(tmp_path):
+    watched, results, _ = semantic_drive(tmp_path, 25)
+    alone = NavigationBrain(watched.config)
+    assert [alone(frame) for frame in open_source(LANDMARKS).frames(0, 25)] == results
+    a, b = watched.state_dict(), alone.state_dict()
+    assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_recording_does_not_change_what_the_brain_does(tmp_path):

@@ -314,7 +314,7 @@ class FakeDevice:
         self.pictures = iter(GREYS[:5])
         self.device = device
 
-    def isOpened(self):
+    def isOpened(self):  # noqa: N802
         return self.opened
 
     def get(self, _):

@@ -74,7 +74,7 @@ def smooth(rng, n, height=10, width=60):
     columns = np.linspace(0, 11.999, width)
     i, j = rows.astype(int), columns.astype(int)
     a, b = (rows - i)[None, :, None], (columns - j)[None, None, :]
-    corner = lambda di, dj: coarse[:, i + di][:, :, j + dj]
+    corner = lambda di, dj: coarse[:, i + di][:, :, j + dj]  # noqa: E731
     top = corner(0, 0) * (1 - b) + corner(0, 1) * b
     return top * (1 - a) + (corner(1, 0) * (1 - b) + corner(1, 1) * b) * a
 
