@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
 from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
+from neuroslam.cli.options import with_plugins
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, say
 from neuroslam.cli.results import (
     evaluate_command,
@@ -85,7 +86,7 @@ _COMMANDS = {
 """In the order in which ``--help`` lists them."""
 
 for _name, _command in _COMMANDS.items():
-    app.command(_name)(_command)
+    app.command(_name)(with_plugins(_command))
 
 
 @contextmanager
