@@ -529,7 +529,7 @@ class HeadDirectionCells(Population):
                 f"HeadDirectionCells: new view {view.template}, expected {self.views.n}; "
                 "views and headings must come from the same life"
             )
-        self.views.append(heading_rad=wrap_angle(self.heading_rad - view.relative_heading_rad))
+        self.views.append(heading_rad=self.heading_rad)
 
     def recall(self, view: ViewMatch) -> float | None:
         """Say by how much a view would have the heading turn; changes nothing.
