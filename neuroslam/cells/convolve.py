@@ -260,3 +260,33 @@ def fourier_convolve(activity: Tensor, transfer: Tensor) -> Tensor:
     """
     arrived = (torch.fft.rfft2(activity) * transfer).sum(-3)
     return torch.fft.irfft2(arrived, s=activity.shape[-2:])
+
+
+def ring_convolve(activity: Tensor, kernels: Tensor) -> Tensor:
+    r"""Convolve activity on a ring with kernels as wide as the ring.
+
+    By ``conv1d`` with circular padding; where each ring of a batch has kernels of its own, by the
+    Fourier transform, which is the same and many times faster there.
+
+    .. math:: h_{m,i} = \sum_j w_{m,\,(i - j) \bmod n} \, r_j
+
+    Args:
+        activity: :math:`r`, shape ``(..., n)``.
+        kernels: :math:`w`, shape ``(m, n)`` for all, or ``(..., m, n)`` for each its own;
+            entry 0 is the weight of a cell to itself.
+
+    Returns:
+        Shape ``(..., m, n)``.
+
+    Example:
+        >>> one = torch.tensor([0.0, 0.0, 0.0, 1.0])
+        >>> ring_convolve(one, torch.tensor([[0.0, 2.0, 3.0, 0.0]]))[0].tolist()
+        [2.0, 3.0, 0.0, 0.0]
+    """
+    m, n = kernels.shape[-2:]
+    if kernels.dim() > 2:
+        spectrum = torch.fft.rfft(activity)[..., None, :] * torch.fft.rfft(kernels)
+        return torch.fft.irfft(spectrum, n=n)
+    around = torch.cat([activity[..., 1:], activity], -1).reshape(-1, 1, 2 * n - 1)
+    out = torch.conv1d(around, kernels.flip(-1)[:, None])  # conv1d correlates
+    return out.reshape(*activity.shape[:-1], m, n)

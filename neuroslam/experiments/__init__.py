@@ -26,6 +26,7 @@ EXPERIMENTS = {
         "boundary_scenarios",
         None,
     ),
+    "head-direction": ("neuroslam.experiments.head_direction", "head_direction", None),
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
     "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
