@@ -442,12 +442,8 @@ class HeadDirectionCells(Population):
         self.activity = inject(self.activity, heading_rad, share, self.ring)
         return wrap_angle(self.heading_rad - before) if self.batch is None else 0.0
 
-    @without_gradients
     def see(self, view: ViewMatch, dt_s: float) -> float:
-        r"""Bind a new view to the heading; let a known one correct it.
-
-        A view corrects within :math:`\tau_v e^{t/\tau_f}` after it has been seen for :math:`t`, so
-        that one that is still recognised while the animal turns does not hold it back.
+        """Bind a new view to the heading; let a known one correct it.
 
         Returns:
             By how much the view turned the heading, in radians.
@@ -455,8 +451,17 @@ class HeadDirectionCells(Population):
         Raises:
             MapError: If the view is new, but not the next, or known, but was never learnt.
         """
-        if view.is_new and view.template == self.views.n:
+        if view.is_new:
             self.bind(view)
+        return self.correct_by_view(view, dt_s)
+
+    @without_gradients
+    def correct_by_view(self, view: ViewMatch, dt_s: float) -> float:
+        r"""Let a known view correct the heading; returns by how much it turned, in radians.
+
+        A view corrects within :math:`\tau_v e^{t/\tau_f}` after it has been seen for :math:`t`, so
+        that one that is still recognised while the animal turns does not hold it back.
+        """
         now = self.last
         if view.template == NO_TEMPLATE:
             now.view, now.seen_s = NO_TEMPLATE, 0.0
@@ -563,7 +568,7 @@ class HeadDirectionCells(Population):
 
     def recall(self, now: StepInput, observation: Heard | None, belief: Belief | None) -> None:
         """Let a known view correct the ring; the map corrects its own heading by it already."""
-        self.see(now.view, now.motion.dt_s)
+        self.correct_by_view(now.view, now.motion.dt_s)
 
     @property
     def rates(self) -> np.ndarray:
