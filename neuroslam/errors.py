@@ -1,7 +1,9 @@
 """Errors that a user can mend: who, what was got, what was expected, what to do, in one line."""
 
 import difflib
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -35,6 +37,36 @@ def counted(n: int, one: str, several: str = "") -> str:
         '1 place is'
     """
     return f"{n:,} {one if n == 1 else several or one + 's'}"
+
+
+class RenamedKeyWarning(FutureWarning):
+    """A config key or option that is called otherwise now; the old name is read for one release."""
+
+
+def with_new_names(
+    values: Mapping[str, Any], renamed: Mapping[str, str], where: str
+) -> dict[str, Any]:
+    """Return values by their present names, and warn of old ones.
+
+    Args:
+        values: By key.
+        renamed: Old name to new one.
+        where: What the keys are of, for the warning.
+
+    Example:
+        >>> with_new_names({"width": 3}, {"breadth": "width"}, "view")
+        {'width': 3}
+    """
+    known = dict(values)
+    for old, new in renamed.items():
+        if old in known and new not in known:
+            warnings.warn(
+                f"{where}: {old} is called {new} now; the old name is read until the next release",
+                RenamedKeyWarning,
+                stacklevel=2,
+            )
+            known[new] = known.pop(old)
+    return known
 
 
 class NeuroslamError(Exception):

@@ -112,7 +112,7 @@ class NavigationBrain(nn.Module):
         self.config = config or BrainConfig()
         self._encoder = view_encoder(self.config.view, features)
         self.about = ("", "", "")  # source, preset and date of the next session
-        self._detects = self.config.sessions.carried == "detect"
+        self._detects = self.config.sessions.kidnapped == "detect"
         self._after_gap_s = -math.inf  # time of a frame that was refused for a gap before it
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
         self.stored = nn.ModuleList()
@@ -242,7 +242,7 @@ class NavigationBrain(nn.Module):
         gap = accepted.gap
         kidnapped = view is not None and self.continuity.breaks(view) and self._detects
         if gap or kidnapped:
-            self.start_new_map("gap" if gap else "carried")
+            self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
@@ -360,13 +360,13 @@ class NavigationBrain(nn.Module):
         self.stored.append(copy)
         self.recognition.store()
 
-    def start_new_map(self, why: str = "carried") -> None:
+    def start_new_map(self, why: str = "kidnapped") -> None:
         """Go on with an empty map, for the robot is no longer where it was.
 
         The map so far is stored; it is joined again when a place of it is recognised.
 
         Args:
-            why: ``carried``, or ``gap``; kept with the new session.
+            why: ``kidnapped``, or ``gap``; kept with the new session.
         """
         if not self.map.n:
             return

@@ -1,5 +1,6 @@
 """One file for a whole brain: safetensors, checked, written at once or not at all. No pickle."""
 
+import warnings
 from pathlib import Path
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.config import BrainConfig, build_config
-from neuroslam.errors import CheckpointError, ConfigError
+from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning
 from neuroslam.state.files import first_line, load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
@@ -34,7 +35,8 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
     """
     about, tensors = load_checked(path, "brain", FORMAT_VERSION)
     try:
-        config = build_config(about.get("config", {}), origin=str(path))
+        with warnings.catch_warnings(action="ignore", category=RenamedKeyWarning):
+            config = build_config(about.get("config", {}), origin=str(path))
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
     if about["format"] == 1:

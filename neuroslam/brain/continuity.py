@@ -1,4 +1,4 @@
-"""Was the robot carried? What it sees changes at once by more than it ever does in driving."""
+"""Was the robot kidnapped? Its view changes at once by more than it does in driving."""
 
 import math
 
@@ -24,7 +24,7 @@ class Continuity(AboutNow):
     r"""Tells from two frames whether the robot could have driven from one to the other.
 
     The change :math:`d` between two frames is the mean difference of their views at the best shift.
-    It was carried if :math:`d > \max(\theta, f\,\tilde d)`: they would not be the same view, and
+    It was kidnapped if :math:`d > \max(\theta, f\,\tilde d)`: they would not be the same view, and
     :math:`d` is :math:`f` times the running median. A turn faster than the views can be shifted
     by makes such a change too, and is let pass.
     """
@@ -33,7 +33,7 @@ class Continuity(AboutNow):
 
     def __init__(self, config: BrainConfig) -> None:
         super().__init__()
-        self.factor = config.sessions.carried_factor
+        self.factor = config.sessions.kidnapped_factor
         self.threshold = config.view.threshold
         self.shift = math.inf if config.view.panoramic else config.view.shift_match
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)

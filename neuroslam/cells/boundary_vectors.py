@@ -59,7 +59,9 @@ def wall_innovation(
     return distance_m - wall.distance_m - dx * nx - dy * ny, normal, dy * nx - dx * ny
 
 
-def unlikeness(walls: Tensor, position_m: Tensor, bearing_rad: Tensor, scale: Tensor) -> Tensor:
+def squared_mismatch(
+    walls: Tensor, position_m: Tensor, bearing_rad: Tensor, scale: Tensor
+) -> Tensor:
     r"""Say how unlike remembered walls are to one that is looked at; below 1 it is the same.
 
     .. math:: \frac{|x_m - x|^2}{s^2} + \frac{(\alpha_m - \alpha)^2}{a^2}

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neuroslam.cells.boundary_vectors import unlikeness, wrap
+from neuroslam.cells.boundary_vectors import squared_mismatch, wrap
 from neuroslam.cells.grid import lahn_drive
 from neuroslam.cells.oscillators import turn_phases, wave_vectors
 from neuroslam.cells.place import EMPTY, FAR_M, NEIGHBOURS
@@ -221,7 +221,7 @@ def _join_walls(loaded: State, partial: State, frames: Frames) -> State:
     other[:, 2] = wrap(other[:, 2] + frames.turn_rad)
     to = n + torch.arange(m)
     if n and m:
-        pairs = unlikeness(one, other[:, None, :2], other[:, None, 2], loaded["walls.scale"])
+        pairs = squared_mismatch(one, other[:, None, :2], other[:, None, 2], loaded["walls.scale"])
         unlike, nearest = pairs.min(1)
         # Each loaded wall takes one, the most alike; the others stay.
         order = unlike.argsort()

@@ -324,7 +324,7 @@ class NavigationCells(Population):
         """Learn where a new view is, or be corrected by where a known one was learnt.
 
         A view near where it was learnt corrects the position a little. Where several views in a row
-        agree that the animal is somewhere else, it was carried there, or lost: it goes there.
+        agree that the animal is somewhere else, it was kidnapped, or lost: it goes there.
 
         Returns:
             Whether it did.

@@ -325,7 +325,7 @@ class PoseCellNetwork(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose at which it was learnt."""
-        return Decision(*map_(now.motion, now.view, self.estimate, now.frame, carried=now.vetoed))
+        return Decision(*map_(now.motion, now.view, self.estimate, now.frame, kidnapped=now.vetoed))
 
     @property
     def rates(self) -> np.ndarray:

@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, wrap
+from neuroslam.cells.boundary_vectors import Wall, squared_mismatch, wall_innovation, wrap
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
 from neuroslam.state.mergeable import BufferModule, without_gradients
@@ -384,7 +384,7 @@ class WallMemory(BufferModule):
         return slot, least < 1.0
 
     def _unlike(self, walls: Tensor, position: Tensor, bearing: Tensor) -> Tensor:
-        return unlikeness(walls, position.unsqueeze(-2), bearing.unsqueeze(-1), self.scale)
+        return squared_mismatch(walls, position.unsqueeze(-2), bearing.unsqueeze(-1), self.scale)
 
     def _recall(
         self, position: Tensor, distance: Tensor, bearing: Tensor,

@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -16,6 +17,7 @@ from typer.core import TyperGroup
 
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
 from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
+from neuroslam.cli.options import with_plugins
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, say
 from neuroslam.cli.results import (
     evaluate_command,
@@ -26,7 +28,7 @@ from neuroslam.cli.results import (
     verify_command,
 )
 from neuroslam.cli.settings import presets_command, tune_command
-from neuroslam.errors import NeuroslamError
+from neuroslam.errors import NeuroslamError, RenamedKeyWarning
 
 
 class _Commands(TyperGroup):
@@ -85,7 +87,7 @@ _COMMANDS = {
 """In the order in which ``--help`` lists them."""
 
 for _name, _command in _COMMANDS.items():
-    app.command(_name)(_command)
+    app.command(_name)(with_plugins(_command))
 
 
 @contextmanager
@@ -104,12 +106,30 @@ def _quiet_writers() -> Iterator[None]:
         threading.excepthook = before
 
 
+@contextmanager
+def _warnings_in_one_line(command: str) -> Iterator[None]:
+    """Print a warning of an old name as a line, once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RenamedKeyWarning)
+        python, printed = warnings.showwarning, set()
+
+        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:  # noqa: ANN401
+            if not issubclass(category, RenamedKeyWarning):
+                python(message, category, *place)
+            elif str(message) not in printed:
+                printed.add(str(message))
+                complain(command, f"note: {message}")
+
+        warnings.showwarning = show
+        yield
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; 0 is success, 2 a mistake the user can mend, 130 an interruption."""
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
     command = arguments[0] if arguments else ""
     try:
-        with _quiet_writers():
+        with _quiet_writers(), _warnings_in_one_line(command):
             return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except typer.Abort:
         complain(command, "interrupted")

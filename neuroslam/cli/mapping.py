@@ -181,7 +181,7 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     if summary.unplaced:
         say(
             f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
-            "where the robot only seemed to be carried: --set sessions.carried=ignore"
+            "where the robot only seemed to be kidnapped: --set sessions.kidnapped=ignore"
         )
     if summary.accuracy:
         say(

@@ -1,6 +1,9 @@
 """Arguments and options that several commands have."""
 
+import inspect
+from collections.abc import Callable
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
 from typing import Annotated
 
@@ -70,3 +73,34 @@ RayAddress = Annotated[
         "--ray", metavar="ADDRESS", help="Use a Ray cluster: HOST:PORT, auto, or local to start one"
     ),
 ]
+
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--plugin",
+        metavar="FILE",
+        help="Python file that registers populations of yours; several are allowed.",
+    ),
+]
+
+
+def with_plugins(command: Callable[..., int]) -> Callable[..., int]:
+    """Let a command take ``--plugin``, and load those files before it runs."""
+
+    @wraps(command)
+    def run(*args: object, plugin: list[Path] | None = None, **options: object) -> int:
+        if plugin:
+            from neuroslam.config.populations import load_plugin
+
+            for file in plugin:
+                load_plugin(file)
+        return command(*args, **options)
+
+    signature = inspect.signature(command)
+    last = inspect.Parameter(
+        "plugin", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Plugins
+    )
+    parameters = [*signature.parameters.values(), last]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {**command.__annotations__, "plugin": Plugins}
+    return run

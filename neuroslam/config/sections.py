@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -14,7 +14,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from neuroslam.errors import did_you_mean, nearest
+from neuroslam.errors import did_you_mean, nearest, with_new_names
 
 Region = tuple[int, int, int, int]
 
@@ -37,9 +37,14 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    renamed: ClassVar[Mapping[str, str]] = {}
+    """Old names of keys, and their present ones."""
+
     @model_validator(mode="wrap")
     @classmethod
     def _say_what_was_meant(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if cls.renamed and isinstance(values, Mapping):
+            values = with_new_names(values, cls.renamed, cls.__name__)
         try:
             return handler(values)
         except ValidationError as error:
@@ -276,6 +281,8 @@ class MapConfig(Section):
 class SessionConfig(Section):
     """How sure a brain must be before it joins its map to a stored one."""
 
+    renamed = {"carried": "kidnapped", "carried_factor": "kidnapped_factor"}
+
     confirm: int = Field(
         4, ge=1, description="places that must agree on how the maps lie; 1: the first view decides"
     )
@@ -290,12 +297,12 @@ class SessionConfig(Section):
         description="how pose-cell states of a joined map move: shifted and turned; only shifted, "
         "as the paper; not at all",
     )
-    carried: Literal["detect", "ignore"] = Field(
+    kidnapped: Literal["detect", "ignore"] = Field(
         "detect",
-        description="a robot that suddenly sees something else was carried: it goes on with a new "
+        description="a robot whose view changes at once was kidnapped: it goes on with a new "
         "map, which is joined to the old one when that is recognised",
     )
-    carried_factor: float = Field(
+    kidnapped_factor: float = Field(
         3.5, gt=1, description="suddenly: the view changes by so many times what it usually does"
     )
     after_gap: Literal["stop", "new_map"] = Field(

@@ -49,7 +49,7 @@ LOSSES = {
     "nothing is lost": "",
     "camera dark for 60 s": "dark=70-130",
     "ranges gone for 60 s": "blind=70-130",
-    "carried half a lap": "carried=100:0.5",
+    "kidnapped by half a lap": "kidnapped=100:0.5",
 }
 _MARKED = "world:corridor?noise=0.05&compass_deg=3&markers=12&width=320&height=160"
 LANDMARKS = {

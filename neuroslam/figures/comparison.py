@@ -116,7 +116,7 @@ def plot_losses(
 
 
 def _shade(ax: mpl.axes.Axes, option: str) -> None:
-    """Mark the time at which a sense is lost, or the robot carried."""
+    """Mark the time at which a sense is lost, or the robot kidnapped."""
     _, _, when = option.partition("=")
     if ":" in when:
         ax.axvline(float(when.split(":")[0]), color=INK, lw=1.0, ls="--", zorder=1)

@@ -10,7 +10,7 @@ from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.least_squares import solve_pose_graph
-from neuroslam.mapping.planning import Plan, quickest_path, shortest_ways
+from neuroslam.mapping.planning import Plan, quickest_path, shortest_path_lengths
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.mapping.tables import (
     ALIAS_COLUMNS,
@@ -177,7 +177,7 @@ class ExperienceMap(Mergeable):
         cells: PoseEstimate,
         frame: int,
         *,
-        carried: bool = False,
+        kidnapped: bool = False,
     ) -> tuple[Action, int]:
         """Take in one frame; returns what was done and the experience the robot is at.
 
@@ -186,7 +186,7 @@ class ExperienceMap(Mergeable):
             view: What was recognised.
             cells: Pose-cell estimate.
             frame: Its number.
-            carried: The robot did not drive to a place that it recognises: no link is made to it.
+            kidnapped: The robot did not drive to where it recognises a view: no link is made.
         """
         self.move(motion)
         action: Action = "none"
@@ -206,9 +206,9 @@ class ExperienceMap(Mergeable):
             if action == "create":
                 corrected = cells._replace(theta=(cells.theta - turned) % self.torus[2])
                 self.create(view.template, corrected, frame, view.relative_heading_rad)
-            elif action == "link" and carried:
+            elif action == "link" and kidnapped:
                 action = "set"
-                self.set(found, view.relative_heading_rad)
+                self.relocalise(found, view.relative_heading_rad)
             elif action == "link":
                 self.link(found, view.relative_heading_rad)
         self.relax()
@@ -317,14 +317,14 @@ class ExperienceMap(Mergeable):
         self._check(target)
         source = self.state.current
         if source == NO_EXPERIENCE:
-            self.set(target, relative_heading_rad)
+            self.relocalise(target, relative_heading_rad)
             return
         if source != target and not self._linked(source, target):
             self._add_link(source, target, relative_heading_rad)
             self.state.at_rest = 0
         self._arrive(target, relative_heading_rad)
 
-    def set(self, target: int, relative_heading_rad: float = 0.0) -> None:
+    def relocalise(self, target: int, relative_heading_rad: float = 0.0) -> None:
         """Go to a known experience without a link; accumulated odometry and time start anew.
 
         Raises:
@@ -410,9 +410,9 @@ class ExperienceMap(Mergeable):
         dx, dy = x - here.x_m, y - here.y_m
         return math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - here.theta_rad)
 
-    def ways_m(self, start: int) -> np.ndarray:
+    def path_lengths_m(self, start: int) -> np.ndarray:
         """Return the length of the shortest way over links to every experience, in m, ``(n,)``."""
-        return shortest_ways(self.links, self.n, start)
+        return shortest_path_lengths(self.links, self.n, start)
 
     def plan(self, goal: int, start: int | None = None) -> Plan:
         """Find the quickest way to an experience by the time its links took, in both directions.

@@ -52,7 +52,7 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
     return Plan(path[::-1], float(distance[goal]))
 
 
-def shortest_ways(links: tuple[np.ndarray, ...], n: int, start: int) -> np.ndarray:
+def shortest_path_lengths(links: tuple[np.ndarray, ...], n: int, start: int) -> np.ndarray:
     """Find how far it is to every experience over links, in both directions (Dijkstra).
 
     Args:
@@ -65,7 +65,7 @@ def shortest_ways(links: tuple[np.ndarray, ...], n: int, start: int) -> np.ndarr
 
     Example:
         >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
-        >>> shortest_ways(links, 3, 2).tolist()
+        >>> shortest_path_lengths(links, 3, 2).tolist()
         [6.0, 1.0, 0.0]
     """
     return dijkstra(_graph(*links[:3], n), indices=start)

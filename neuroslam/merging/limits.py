@@ -45,6 +45,6 @@ def far_off(
     Returns:
         Metres by which each pair is off, and by which it may be.
     """
-    way_m = partial.ways_m(int(pairs.partial[0]))[pairs.partial]
-    way_m = way_m + loaded.ways_m(int(pairs.loaded[0]))[pairs.loaded]
+    way_m = partial.path_lengths_m(int(pairs.partial[0]))[pairs.partial]
+    way_m = way_m + loaded.path_lengths_m(int(pairs.loaded[0]))[pairs.loaded]
     return misfits_m(pairs, partial.poses, loaded.poses), limits.place_m + limits.drift * way_m

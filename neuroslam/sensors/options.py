@@ -4,7 +4,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from neuroslam.errors import SourceError, did_you_mean
+from neuroslam.errors import SourceError, did_you_mean, with_new_names
 
 Options = TypeVar("Options", bound=BaseModel)
 
@@ -31,8 +31,11 @@ def parse_options(who: str, query: str, model: type[Options]) -> Options:
         neuroslam.errors.SourceError: ring: unknown option 'lap'; there are laps; did you mean ...
     """
     values: dict[str, str] = {}
+    renamed: dict[str, str] = getattr(model, "renamed", {})
     for item in filter(None, query.split("&")):
         key, equals, value = item.partition("=")
+        if key in renamed:
+            key = next(iter(with_new_names({key: value}, renamed, who)))
         if key not in model.model_fields:
             raise SourceError(
                 f"{who}: unknown option {key!r}; there are {', '.join(model.model_fields)}"

@@ -341,7 +341,7 @@ class SemanticCells(Population):
             now.told = attended
             place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
         lost = lost and self._is_inside(place)
-        if lost:  # its landmarks contradict for long: it was carried, or has drifted far
+        if lost:  # its landmarks contradict for long: it was kidnapped, or has drifted far
             self.relocalise(place)
         correction, turn = (0.0, 0.0), 0.0
         if self.follows != "cells":

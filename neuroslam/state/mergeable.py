@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import ClassVar, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -23,11 +23,17 @@ Rule = Callable[[Tensor, Tensor, Join], Tensor]
 
 
 class BufferModule(nn.Module):
-    """A module whose state is in buffers that are replaced in every step."""
+    """A module whose state is in buffers that are replaced in every step.
+
+    Attributes:
+        growing: Names of buffers that take the shape that was saved when a state is loaded.
+    """
+
+    growing: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_load_state_dict_pre_hook(_make_writable)
+        self.register_load_state_dict_pre_hook(_make_room)
 
     def __setattr__(self, name: str, value: object) -> None:
         """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
@@ -69,10 +75,18 @@ class AboutNow(Mergeable):
         return dict(partial)
 
 
-def _make_writable(module: nn.Module, *_unused: object) -> None:
-    """Replace what was made in inference mode, which torch would not let a state be copied into."""
+def _make_room(module: BufferModule, state: State, prefix: str, *_unused: object) -> None:
+    """Give growing buffers the saved shape, and replace what was made in inference mode.
+
+    Torch copies a state into tensors that are there, and refuses both.
+    """
     for name, buffer in module._buffers.items():
-        if buffer is not None and buffer.is_inference():
+        saved = state.get(prefix + name)
+        if buffer is None:
+            continue
+        if name in module.growing and saved is not None:
+            module._buffers[name] = buffer.new_empty(saved.shape)
+        elif buffer.is_inference():
             module._buffers[name] = buffer.clone()
     for name, parameter in module._parameters.items():
         if parameter is not None and parameter.is_inference():

@@ -344,6 +344,6 @@ class LeadableMap(Protocol):
         """Go to an experience by position."""
 
     def __call__(
-        self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int, *, carried: bool
+        self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int, *, kidnapped: bool
     ) -> tuple[Action, int]:
         """Integrate odometry, and go to an experience by view."""

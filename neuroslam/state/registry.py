@@ -70,7 +70,7 @@ def _check_merges(cls: type[Population]) -> None:
         one, other = (cls.build(BrainConfig(), cls) for _ in range(2))
     except Exception as error:
         raise ConfigError(
-            f"{what}: cannot be built from its default config "
+            f"{what}: cannot be built from the default config "
             f"({type(error).__name__}: {error}); every parameter needs a default"
         ) from error
     loaded, partial = one.state_dict(), other.state_dict()

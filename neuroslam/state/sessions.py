@@ -27,8 +27,8 @@ class Session:
         first_frame: Number of its first frame in the source.
         first_time_s: Time of that frame.
         frames: Frames seen.
-        began: Why it is a session of its own: ``start``, ``carried`` or ``gap``.
-        continues: Session that it goes on from, where it was carried or after a gap; else 0.
+        began: Why it is a session of its own: ``start``, ``kidnapped`` or ``gap``.
+        continues: Session that it goes on from, where it was kidnapped or after a gap; else 0.
     """
 
     id: int

@@ -59,7 +59,7 @@ def drive_through(
     Returns:
         The brain, and the place of each frame's index.
     """
-    sessions = config.sessions.model_copy(update={"carried": "ignore"})
+    sessions = config.sessions.model_copy(update={"kidnapped": "ignore"})
     alone = config.model_copy(update={"cells": ("pose",), "sessions": sessions, "max_gap_s": 1e9})
     now = -1
 

@@ -1,7 +1,7 @@
 """Rendered worlds as sources: ``world:corridor?laps=2&people=1`` is a camera driven through one."""
 
 import math
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -82,6 +82,7 @@ class OdometryNoise(NamedTuple):
 class WorldOptions(BaseModel):
     """What may follow the ``?`` of a world's name."""
 
+    renamed: ClassVar[dict[str, str]] = {"carried": "kidnapped"}
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     laps: float | None = Field(None, gt=0, le=10_000, description="laps; none: as the world's")
@@ -130,10 +131,10 @@ class WorldOptions(BaseModel):
     blind: str = Field(
         "", pattern=r"^(\d+-\d+)?$", description="the scanner measures nothing, seconds, as 60-120"
     )
-    carried: str = Field(
+    kidnapped: str = Field(
         "",
         pattern=r"^(\d+:0?\.\d+)?$",
-        description="the robot is carried, as 60:0.5: at 60 s on by half a lap",
+        description="the robot is kidnapped, as 60:0.5: at 60 s on by half a lap",
     )
 
     def odometry_noise(self) -> OdometryNoise:
@@ -209,13 +210,13 @@ class WorldSource(IndexedSource):
         along = first + np.arange(self.n_frames)
         self._truths = lap[along % self.frames_per_lap]
         moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
-        if options.carried:
-            at_s, share = options.carried.split(":")
+        if options.kidnapped:
+            at_s, share = options.kidnapped.split(":")
             at = max(1, round(float(at_s) * options.rate))
             along[at:] += round(float(share) * self.frames_per_lap)
             self._truths = lap[along % self.frames_per_lap]
             drive = np.diff(self._truths, axis=0, prepend=self._truths[:1])
-            drive[at : at + 1] = moved[at : at + 1]  # wheels do not feel that one is carried
+            drive[at : at + 1] = moved[at : at + 1]  # wheels do not feel a kidnapping
             moved = drive
         self.places_m = np.empty((0, 2))
         if options.markers:

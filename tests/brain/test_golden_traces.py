@@ -167,7 +167,7 @@ def a_life(cells: str, out: Path) -> dict:
     traces = {"first": drive(first, with_walls(frames_of("laps=1.2")), out / "first")}
     second = brain_of(cells)
     second.store(first)
-    later = frames_of("laps=1&start=0.4&seed=1&carried=5:0.35&dark=8-9")
+    later = frames_of("laps=1&start=0.4&seed=1&kidnapped=5:0.35&dark=8-9")
     later = with_gap(later, 110, 5.0)
     traces["second, with a stored map, kidnapped, after a gap"] = drive(
         second, later, out / "second"

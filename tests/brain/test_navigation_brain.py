@@ -170,7 +170,7 @@ def test_who_was_carried_says_that_it_is_lost_and_learns_nothing_then(arena):
 def test_who_sees_recovers_from_being_carried(carried):
     source = open_source("world:ellipse?laps=3&noise=0.03&ranges=180")
     frames = list(source.frames(0, 801)) + list(source.frames(1000, 1201))
-    brain = brain_of("ratslam_slrb", sessions={"carried": carried})
+    brain = brain_of("ratslam_slrb", sessions={"kidnapped": carried})
     told, truth, _ = lives(brain, renumbered(frames, 0.1))
     before = align(told[:800], truth[:800])
     off = np.linalg.norm(before.apply(told) - truth, axis=1)

@@ -243,7 +243,7 @@ def test_a_carried_robot_keeps_its_map_and_finds_itself_in_it_again(corridor):
     assert when[1][0] < 280
     (report,) = brain.sessions.merges
     assert report["reason"] == "nothing is new: the place was known"
-    assert [s.began for s in brain.sessions.sessions] == ["start", "carried"]
+    assert [s.began for s in brain.sessions.sessions] == ["start", "kidnapped"]
     # Frames 250 to 299 are new ground: then it is the map of one who was never carried.
     uncarried = lived(corridor[:300])
     assert sizes(brain)[:2] == sizes(uncarried)[:2]
@@ -265,7 +265,7 @@ def test_a_robot_carried_to_unknown_ground_joins_its_maps_when_the_loop_comes_ro
 
 
 def test_a_robot_that_is_told_to_ignore_it_goes_on_in_one_map(corridor):
-    config = BrainConfig(sessions={"carried": "ignore"})
+    config = BrainConfig(sessions={"kidnapped": "ignore"})
     brain = lived(in_order(corridor, [*range(250), *range(100, 150)]), config)
     assert len(brain.stored) == 0
     assert [s.began for s in brain.sessions.sessions] == ["start"]
@@ -286,7 +286,7 @@ def with_a_gap(corridor):
 
 
 def test_after_a_long_gap_a_new_map_is_begun_and_joined(with_a_gap):
-    brain = NavigationBrain(BrainConfig(sessions={"after_gap": "new_map", "carried": "ignore"}))
+    brain = NavigationBrain(BrainConfig(sessions={"after_gap": "new_map", "kidnapped": "ignore"}))
     for k, frame in enumerate(with_a_gap):
         brain(frame)
         if k == 150:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells import walls as walls_module
-from neuroslam.cells.boundary_vectors import Wall, unlikeness, wall_innovation, wrap
+from neuroslam.cells.boundary_vectors import Wall, squared_mismatch, wall_innovation, wrap
 from neuroslam.cells.walls import OWN, WallMemory, check_motion
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
@@ -157,7 +157,7 @@ def test_a_wall_is_the_same_within_the_spread_and_another_beyond():
         (0.2, 10.0, False),
     ):
         bearing = tensor(-math.pi + math.radians(off_deg))
-        assert (unlikeness(wall, tensor([0.0, off_m]), bearing, scale) < 1.0).item() == same
+        assert (squared_mismatch(wall, tensor([0.0, off_m]), bearing, scale) < 1.0).item() == same
 
 
 # One wall

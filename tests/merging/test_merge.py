@@ -766,7 +766,7 @@ def test_a_life_and_the_copy_that_went_on_are_the_life_that_went_on(ellipse):
 
 
 def test_copies_that_went_different_ways_are_told_apart(ellipse):
-    config = BrainConfig(sessions={"carried": "ignore"})
+    config = BrainConfig(sessions={"kidnapped": "ignore"})
     brain = lived(ellipse[:100], config)
     state = {k: v.clone() for k, v in brain.state_dict().items()}
     for frame in ellipse[100:200]:
