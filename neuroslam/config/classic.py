@@ -92,7 +92,7 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
             else:
                 raise ConfigError(
                     f"config {path}: unknown key {key!r} in [{section}]"
-                    f"{did_you_mean(key, [*CLASSIC_NAMES, 'camera_hz'])}"
+                    f"{did_you_mean(key, _classic_keys())}"
                 )
     for prefix, edges in regions.items():
         where, name = _CLASSIC_REGIONS[prefix]
@@ -109,6 +109,12 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
     if not math.isfinite(values.get("frame_rate_hz", 1.0)):
         raise ConfigError(f"config {path}: camera_hz is not a finite number")
     return values
+
+
+def _classic_keys() -> list[str]:
+    edges = ("x_min", "x_max", "y_min", "y_max")
+    regions = [f"{region}_{edge}" for region in _CLASSIC_REGIONS for edge in edges]
+    return [*CLASSIC_NAMES, "camera_hz", *regions, *sorted(_CLASSIC_IGNORED)]
 
 
 def _as_field(section: str, name: str, number: float) -> float | int | bool:

@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from neuroslam.config.brain import BrainConfig
 from neuroslam.config.classic import from_classic
@@ -46,7 +46,9 @@ def read_config_file(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"config {path}: no such file") from None
+        preset = path.name.removesuffix(".toml")
+        hint = f"; {preset} is a preset, --preset {preset}" if preset in preset_names() else ""
+        raise ConfigError(f"config {path}: no such file{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"config {path}: cannot be read as text ({error})") from None
     if path.suffix.lower() in (".ini", ".txt"):
@@ -104,8 +106,8 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(part for part in first["loc"] if isinstance(part, str))
-        if first["type"] == "extra_forbidden":
-            raise ConfigError(f"{origin}: unknown key {where!r}{_key_meant(where)}") from None
+        if first["type"] == "unknown_key":
+            raise ConfigError(f"{origin}: {first['msg']}") from None
         said = first["msg"].removeprefix("Value error, ")
         said = said[0].lower() + said[1:]
         if first["type"] == "model_type":
@@ -113,25 +115,6 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         elif where.endswith(("crop", "region")):
             said = "expected four whole numbers x_min, x_max, y_min, y_max"
         raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
-
-
-def _all_keys(section: type[BaseModel] = BrainConfig, path: str = "") -> list[str]:
-    keys = []
-    for name, field in section.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            keys += [f"{path}{name}", *_all_keys(inner, f"{path}{name}.")]
-        else:
-            keys.append(f"{path}{name}")
-    return keys
-
-
-def _key_meant(word: str) -> str:
-    known, last = _all_keys(), word.rpartition(".")[2]
-    without_section = [key for key in known if key.rpartition(".")[2] == last]
-    return did_you_mean(word, known) or "".join(
-        f"; did you mean {key!r}?" for key in without_section[:1]
-    )
 
 
 def to_toml(config: BrainConfig) -> str:

@@ -160,7 +160,8 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
                     (beside / file).write_text(empty)
             summary = write_results(brain, plan, beside, RunSummary())
             out.mkdir(exist_ok=True)
-            for file in ("brain.safetensors", *dict.fromkeys(run_files(out) + run_files(beside))):
+            # The brain first, and each once: what is not beside any more is of an earlier run.
+            for file in dict.fromkeys(("brain.safetensors", *run_files(out), *run_files(beside))):
                 if (beside / file).exists():
                     (beside / file).replace(out / file)
                 else:  # of an earlier run: it would not fit the new map

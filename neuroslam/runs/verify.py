@@ -266,31 +266,39 @@ def _table_fault(path: Path, expected: str) -> str:
         header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
         if header != columns:
             return f"its columns are {header!r}, expected {columns!r}"
-        rows = [_values(line) for line in lines]
+        text = {i for line in should for i, cell in enumerate(line.split(",")) if _is_text(cell)}
+        rows = [_values(line, columns, text) for line in lines]
     except (OSError, ValueError) as error:
         return f"cannot be read ({_why(error)})"
     if len(rows) != len(should):
         return f"{counted(len(rows), 'row')}, the brain has {len(should)}"
     differ = [i for i, (row, line) in enumerate(zip(rows, should, strict=True))
-              if row != _values(line)]  # fmt: skip
+              if row != _values(line, columns, text)]  # fmt: skip
     return f"rows {listed(differ)} differ from the brain" if differ else ""
 
 
-def _values(line: str) -> list[str | float]:
-    """Parse a row of a CSV table: numbers where they can be read as such, else text.
+def _values(line: str, columns: str, text: set[int]) -> list[str | float]:
+    """Parse a row of a CSV table: text in the columns that hold text, numbers in all others.
+
+    Raises:
+        ValueError: If the row has too few or too many values, or one is not a number.
 
     Example:
-        >>> _values("landmark_1,0.50,3")
+        >>> _values("landmark_1,0.50,3", "name,x_m,seen", {0})
         ['landmark_1', 0.5, 3.0]
     """
-    return [_number_or_text(cell) for cell in line.split(",")]
+    cells, n = line.split(","), columns.count(",") + 1
+    if len(cells) != n:
+        raise ValueError(f"a row has {counted(len(cells), 'value')}, expected {n}")
+    return [cell if i in text else float(cell) for i, cell in enumerate(cells)]
 
 
-def _number_or_text(cell: str) -> str | float:
+def _is_text(cell: str) -> bool:
     try:
-        return float(cell)
+        float(cell)
     except ValueError:
-        return cell
+        return True
+    return False
 
 
 def _why(error: Exception) -> str:

@@ -55,7 +55,7 @@ def test_the_presets_the_data_need_are_there():
         ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
         ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
         ({"map": {"solver": "relx"}}, r"map.solver = 'relx': .*; did you mean 'relax'\?$"),
-        ({"cells": "pose+plase"}, r"cells = 'plase': .*; did you mean 'place'\?$"),
+        ({"cells": "pose+plase"}, r"unknown population 'plase'; .*; did you mean 'place'\?"),
         ({"veiw": {}}, r"config: unknown key 'veiw'; did you mean 'view'\?$"),
         ({"view": {"n_xy": 9}}, r"unknown key 'view\.n_xy'; did you mean 'pose_cells\.n_xy'\?$"),
         (
@@ -117,7 +117,7 @@ def test_a_config_made_in_python_says_what_was_meant(make, where, said):
 
 def test_what_else_is_wrong_is_told_after_unknown_keys():
     with pytest.raises(ValidationError) as caught:
-        BrainConfig(view={"threshold": 2}, map={"solver": "relx"}, threads=0, cels="pose")
+        BrainConfig(map={"solver": "relx"}, threads=0, view={"threshold": 2, "crp": None})
     errors = caught.value.errors()
     assert [error["type"] for error in errors] == [
         "unknown_key", "less_than", "literal_error", "greater_than_equal",

@@ -262,6 +262,8 @@ def test_a_merge_leaves_no_landmarks_of_an_earlier_run(runs, merged, tmp_path, c
     (out / "landmarks.csv").write_text("name,x_m,y_m,seen,first_frame,experience\n")
     assert call("merge", runs / "a", runs / "b", "-o", out, "--overwrite").code == 0
     assert not (out / "landmarks.csv").exists()  # the merged map has no semantic cells
+    assert {path.name for path in out.iterdir()} == {path.name for path in merged.iterdir()}
+    assert (out / "brain.safetensors").is_file()
 
 
 def test_maps_of_different_configs_are_refused_and_the_keys_named(runs, tmp_path, call):
