@@ -7,12 +7,10 @@ import torch
 from benchmarks.bench_relaxation import laps
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.brain import NavigationBrain
-from neuroslam.merging.merge import merge
-from neuroslam.state.match import Match
 from neuroslam.brain.recognition import StoredViews
-from neuroslam.state.sessions import Session
 from neuroslam.config import BrainConfig
-from neuroslam.state.match import Pairs
+from neuroslam.state.match import Match, Pairs
+from neuroslam.state.sessions import Session
 from neuroslam.view.search import block_means
 
 SIZES = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
@@ -60,9 +58,9 @@ def rows() -> list[Row]:
     found = []
     for n in SIZES:
         one, other, match = mapped(n, 1), mapped(n, 2), meeting(n)
-        merged, report = merge(one, other, match)
+        merged, report = one.merge(other, match)
         assert merged is not None, report.reason
-        ms = cpu_ms(lambda one=one, other=other, match=match: merge(one, other, match), 1, 5)
+        ms = cpu_ms(lambda one=one, other=other, match=match: one.merge(other, match), 1, 5)
         target = "<= 500 ms" if n == TARGET else "linear"
         found.append(Row("merge of two maps", f"{n} places each", "-", target, f"{ms:.0f} ms"))
     rng = np.random.default_rng(3)
@@ -89,4 +87,4 @@ def rows() -> list[Row]:
 def test_merge(benchmark, n):
     torch.set_num_threads(1)
     one, other, match = mapped(n, 1), mapped(n, 2), meeting(n)
-    benchmark(merge, one, other, match)
+    benchmark(one.merge, other, match)

@@ -26,14 +26,14 @@ import numpy as np
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
-from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import MergeReport
 from neuroslam.evaluation.icp import fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import align
 from neuroslam.experiments.lives import Picture, bindings, live, measure, stage, track
 from neuroslam.figures.maps import contact_sheet, plot_frame_and_template, plot_map
 from neuroslam.figures.sessions import plot_bindings, plot_overlay, plot_stages
 from neuroslam.figures.style import SESSIONS, STYLE, legend_below, write_title
+from neuroslam.merging.match import find_match
+from neuroslam.merging.report import MergeReport
 from neuroslam.runs.merge import join_brains
 
 torch.set_num_threads(1)

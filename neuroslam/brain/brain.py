@@ -249,7 +249,7 @@ class NavigationBrain(nn.Module):
         self.continuity.moved(velocity, dt_s)
         match = BLIND if view is None else self.view.recognise(view)
         if not self.sessions.sessions:
-            self._name_session(accepted)
+            self._name_session(frame, accepted.observed)
         return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
@@ -406,10 +406,10 @@ class NavigationBrain(nn.Module):
         while tally.n < len(stored):
             tally.append(alike=0, agreed=0)
 
-    def _name_session(self, accepted: Accepted) -> None:
+    def _name_session(self, frame: Frame, observed: dict[str, Any]) -> None:
         """Open a session; its id follows from what it begins with."""
-        frame, found = accepted.frame, []
-        for observation in accepted.observed.values():
+        found = []
+        for observation in observed.values():
             found += observation if isinstance(observation, tuple) else [observation]
         self._open(
             Session(

@@ -166,7 +166,7 @@ def test_a_file_whose_first_byte_is_a_pickles_is_read_all_the_same(tmp_path):
     brain = NavigationBrain(config)
     for length in range(256):
         brain.about = ("x" * length, "", "")
-        brain._name_session(Frame(0, 0.0), brain._sense(Frame(0, 0.0)))
+        brain._name_session(Frame(0, 0.0), {})
         brain.sessions.sessions = brain.sessions.sessions[-1:]
         about = {"format": FORMAT_VERSION, "config": config.model_dump(mode="json")}
         tensors = brain.state_dict()

@@ -12,12 +12,13 @@ from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import BadFrame, MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
 from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import make_join, merge
+from neuroslam.merging.states import make_join
 from neuroslam.sensors import open_source
 from neuroslam.spiking.landmark_frames import shared_frames
 from neuroslam.spiking.semantic import SemanticCells
-from neuroslam.spiking.sightings import Guide, Sightings
+from neuroslam.spiking.sightings import Sightings
 from neuroslam.state.match import Match
+from neuroslam.state.population import Belief
 from neuroslam.types import Frame, Motion, Pose, Velocity
 
 SETS = [
@@ -68,8 +69,8 @@ def test_a_brain_that_was_saved_goes_on_as_one_that_never_stopped(cells, drive, 
 def test_every_number_of_every_population_has_a_rule_of_merging(cells, drive):
     loaded, partial = (lives(brain_of(cells), drive[a:b]) for a, b in ((0, 40), (20, 60)))
     states = loaded.state_dict(), partial.state_dict()
-    join = make_join(*states, Match(0, 0), partial.config)
-    for name, part in partial.populations().items():
+    join = make_join(*states, Match(0, 0), partial.config, partial.parts())
+    for name, part in partial.parts().items():
         own = [
             {key[len(name) + 1 :]: v for key, v in state.items() if key.startswith(f"{name}.")}
             for state in states
@@ -77,7 +78,7 @@ def test_every_number_of_every_population_has_a_rule_of_merging(cells, drive):
         merged = part.merged(*own, join)
         assert set(merged) == set(own[0]) == set(own[1]), name
         assert {k: v.dtype for k, v in merged.items()} == {k: v.dtype for k, v in own[1].items()}
-    assert "semantic" not in cells or "semantic" in partial.populations()
+    assert "semantic" not in cells or "semantic" in partial.parts()
 
 
 @pytest.mark.parametrize("cells", ["semantic", "pose+semantic", "pose+place+semantic"])
@@ -105,7 +106,7 @@ def taught(n=4, steps=30, follows="nothing"):
     cells = SemanticCells(SemanticConfig(), follows=follows)
     ring = [(k, 2.0, 2.0 * math.pi * k / n) for k in range(n)]
     for _ in range(steps * n):
-        cells.live(Motion(0.0, 0.0, 0.1), seen(*ring))
+        cells.advance(Motion(0.0, 0.0, 0.1), seen(*ring))
     return cells, ring
 
 
@@ -114,7 +115,7 @@ def test_a_landmark_that_most_others_contradict_is_not_learnt():
     before = cells.landmarks()["place_m"].copy()
     wrong = [(0, 5.0, 1.0), *ring[1:]]
     for _ in range(40):
-        cells.live(Motion(0.0, 0.0, 0.1), seen(*wrong))
+        cells.advance(Motion(0.0, 0.0, 0.1), seen(*wrong))
     np.testing.assert_allclose(cells.landmarks()["place_m"], before, atol=0.02)
     assert math.hypot(*cells.pose[:2]) < 0.02
 
@@ -122,10 +123,10 @@ def test_a_landmark_that_most_others_contradict_is_not_learnt():
 @pytest.mark.parametrize("follows", ["nothing", "map"])
 def test_a_landmark_that_was_first_seen_where_it_is_not_is_found_where_it_is(follows):
     cells = SemanticCells(SemanticConfig(), follows=follows)
-    guide = Guide(Pose(0.0, 0.0, 0.0), 0.0, 0, np.zeros((1, 3))) if follows == "map" else None
-    cells.live(Motion(0.0, 0.0, 0.1), seen((5, 6.0, 2.0)), guide=guide)
+    belief = Belief(Pose(0.0, 0.0, 0.0), 0.0, 0, np.zeros((1, 3))) if follows == "map" else None
+    cells.advance(Motion(0.0, 0.0, 0.1), seen((5, 6.0, 2.0)), belief=belief)
     for _ in range(30):
-        cells.live(Motion(0.0, 0.0, 0.1), seen((5, 2.0, 0.0)), guide=guide)
+        cells.advance(Motion(0.0, 0.0, 0.1), seen((5, 2.0, 0.0)), belief=belief)
     np.testing.assert_allclose(cells.landmarks()["place_m"], [[2.0, 0.0]], atol=0.05)
 
 
@@ -133,7 +134,7 @@ def test_landmarks_without_names_are_told_apart_by_their_places():
     cells = SemanticCells(SemanticConfig())
     ring = [(-1, 3.0, 2.0 * math.pi * k / 5) for k in range(5)]
     for _ in range(60):
-        cells.live(Motion(0.0, 0.0, 0.1), seen(*ring))
+        cells.advance(Motion(0.0, 0.0, 0.1), seen(*ring))
     known = cells.landmarks()
     assert cells.n == 5
     expected = np.array([(3.0 * math.cos(b), 3.0 * math.sin(b)) for _, _, b in ring])
@@ -163,7 +164,7 @@ def test_a_brain_without_cells_for_a_compass_does_not_mind_a_broken_one(drive):
 
 def test_what_was_seen_once_is_no_landmark():
     cells, ring = taught()
-    cells.live(Motion(0.0, 0.0, 0.1), seen(*ring, (99, 1.0, 0.5)))
+    cells.advance(Motion(0.0, 0.0, 0.1), seen(*ring, (99, 1.0, 0.5)))
     assert 99 not in cells.landmarks()["number"]
     assert cells.n == len(ring)
 
@@ -177,7 +178,7 @@ def test_who_was_carried_is_told_by_known_landmarks_where_it_is():
     for _ in range(30):
         rows = [(k, np.hypot(*(p - there)), math.atan2(*(p - there)[::-1])) for k, p in
                 places.items()]  # fmt: skip
-        told = cells.live(Motion(0.0, 0.0, 0.1), seen(*rows), compass_rad=0.0)
+        told = cells.advance(Motion(0.0, 0.0, 0.1), seen(*rows), compass_rad=0.0)
     np.testing.assert_allclose(cells.pose[:2], there, atol=0.1)
     assert not told.lost
 
@@ -185,20 +186,20 @@ def test_who_was_carried_is_told_by_known_landmarks_where_it_is():
 def test_bearings_of_landmarks_keep_an_integrated_heading_from_drifting():
     cells, ring = taught()
     for _ in range(100):  # it stands still, and its gyroscope says that it turns
-        cells.live(Motion(0.0, 0.05, 0.1), seen(*ring))
+        cells.advance(Motion(0.0, 0.05, 0.1), seen(*ring))
     assert abs(cells.pose.theta_rad) < 0.3  # alone it would be 0.5
     free = SemanticCells(SemanticConfig(heading_rate_hz=0.0))
     for _ in range(100):
-        free.live(Motion(0.0, 0.05, 0.1), seen())
+        free.advance(Motion(0.0, 0.05, 0.1), seen())
     assert free.pose.theta_rad == pytest.approx(0.5, abs=1e-9)
 
 
 def test_landmarks_move_with_the_experiences_at_which_they_were_met():
     cells = SemanticCells(SemanticConfig(), follows="map")
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    guide = Guide(Pose(1.0, 0.0, 0.0), 0.0, 1, poses)
+    belief = Belief(Pose(1.0, 0.0, 0.0), 0.0, 1, poses)
     for _ in range(30):
-        cells.live(Motion(0.0, 0.0, 0.1), seen((3, 1.0, 0.0)), guide=guide)
+        cells.advance(Motion(0.0, 0.0, 0.1), seen((3, 1.0, 0.0)), belief=belief)
     np.testing.assert_allclose(cells.landmarks()["place_m"], [[2.0, 0.0]], atol=0.02)
     relaxed = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, math.pi / 2]])
     assert cells.follow_map(relaxed)
@@ -361,7 +362,7 @@ def test_a_merge_of_two_sessions_is_the_union_of_all_that_they_know(cells, sessi
     loaded, partial = (lives(brain_of(cells), frames) for frames in sessions.values())
     found = find_match(loaded, partial)
     assert found.match is not None, found.reason
-    merged, report = merge(loaded, partial, found.match)
+    merged, report = loaded.merge(partial, found.match)
     assert report.merged, report.reason
     counts = report.counts["landmarks"]
     assert counts["loaded"] == counts["partial"] == counts["merged"] == 12

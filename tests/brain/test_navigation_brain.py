@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.cells.wall_matching import Outline, lay_walls
+from neuroslam.cells.wall_matching import Outline, align_outlines
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.errors import BadFrame
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
@@ -127,7 +127,7 @@ def test_runs_are_resumed_and_equal_and_sound(tmp_path):
 def test_verify_finds_what_makes_no_sense(squares, tmp_path):
     file = tmp_path / "brain.safetensors"
     brain = brain_of("slrb")
-    brain.take(squares[0].state_dict(), [])
+    brain.restore(squares[0].state_dict(), [])
     brain.navigation.place.neighbours[0, 3, 0] = 5000
     brain.navigation.walls.active[0, 0] = 999
     save_brain(brain, file)
@@ -148,7 +148,7 @@ def test_who_was_carried_says_that_it_is_lost_and_learns_nothing_then(arena):
            if np.linalg.norm(place[k] - place[start - 1]) > 0.5]  # fmt: skip
     noticed = []
     for to in far:
-        brain.take({name: value.clone() for name, value in state.items()}, [])
+        brain.restore({name: value.clone() for name, value in state.items()}, [])
         _, _, lost = lives(
             brain,
             [f._replace(index=start + i, time_s=0.05 * (start + i))
@@ -301,7 +301,7 @@ def test_parallel_walls_alone_are_refused():
     x = np.linspace(0.0, 3.0, 12)
     feet = np.concatenate([np.column_stack([x, 0 * x]), np.column_stack([x, 0 * x + 1.0])])
     bearings = np.repeat([-np.pi / 2, np.pi / 2], 12)
-    laid = lay_walls(Outline(feet, bearings), Outline(feet, bearings), [0.0], 0.25, 0.05)
+    laid = align_outlines(Outline(feet, bearings), Outline(feet, bearings), [0.0], 0.25, 0.05)
     assert laid.spread < 0.01
 
 
@@ -314,7 +314,7 @@ def test_an_outline_is_found_again_wherever_it_was_put(turn):
     bearings = np.concatenate([np.full(len(x), b) for b, (x, _) in sides.items()])
     outline = Outline(feet, bearings)
     moved = outline.moved(turn, np.array([3.0, -1.0]))
-    laid = lay_walls(outline, moved, [2 * np.pi * k / 12 for k in range(12)], 0.25, 0.05)
+    laid = align_outlines(outline, moved, [2 * np.pi * k / 12 for k in range(12)], 0.25, 0.05)
     assert laid.n_same == len(feet)
     assert abs(wrap_angles(np.array([laid.turn_rad + turn]))[0]) < 1e-6
     np.testing.assert_allclose(moved.moved(laid.turn_rad, laid.move_m).feet_m, feet, atol=1e-6)

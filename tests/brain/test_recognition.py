@@ -9,7 +9,6 @@ import torch
 from neuroslam import BrainConfig, NavigationBrain, load_brain, save_brain
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import merge
 from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
 from neuroslam.view.templates import LocalViewCells
@@ -421,8 +420,8 @@ def test_lives_that_overlap_are_joined_where_the_same_search_refuses_others(corr
     for one, two in pairwise(lives):
         found = find_match(one, two)
         assert found.match is not None, found.reason
-        merged, report = merge(one, two, found.match)
+        merged, report = one.merge(two, found.match)
         assert merged is not None, report.reason
-        other_way, report = merge(two, one, find_match(two, one).match)
+        other_way, report = two.merge(one, find_match(two, one).match)
         assert other_way is not None, report.reason
         assert abs(other_way.map.n - merged.map.n) <= 2

@@ -196,7 +196,7 @@ def test_input_that_cannot_be_is_refused_and_changes_nothing(batch, change, comp
 
 def test_a_frame_that_cannot_be_is_refused_and_changes_nothing():
     cells = NavigationCells(CONFIG)
-    cells.live(Motion(0.1, 0.2, 0.1), None, np.array([[0.2, 0.1]]))
+    cells.advance(Motion(0.1, 0.2, 0.1), None, np.array([[0.2, 0.1]]))
     before = copied(cells)
     for motion, compass, walls in (
         (Motion(math.nan, 0.0, 0.1), 0.0, None),
@@ -207,7 +207,7 @@ def test_a_frame_that_cannot_be_is_refused_and_changes_nothing():
         (Motion(0.1, 0.0, 0.1), None, np.array([[0.1, math.nan]])),
     ):
         with pytest.raises(BadFrame):
-            cells.live(motion, compass, walls)
+            cells.advance(motion, compass, walls)
         assert_same(before, cells.state_dict())
 
 
@@ -222,7 +222,7 @@ def test_frames_are_lived_as_steps_are_and_walls_may_come_in_any_order():
         walls = np.column_stack([senses.wall_m[0, k], senses.wall_bearing_rad[0, k]])
         walls = np.flipud(walls[np.isfinite(walls[:, 0])]).copy()
         motion = Motion(float(senses.speed_m_s[0, k]), 0.0, dt_s)
-        frames.live(motion, float(senses.heading_rad[0, k]), walls if len(walls) else None)
+        frames.advance(motion, float(senses.heading_rad[0, k]), walls if len(walls) else None)
         x, y, theta = frames.pose
         assert (x, y) == pytest.approx(expected[k].tolist(), abs=1e-4)
         heading = senses.heading_rad[0, k] - frames.heading_error_rad
@@ -233,7 +233,7 @@ def test_without_a_compass_turns_are_added_to_the_heading_of_the_start():
     cells = NavigationCells(CONFIG)
     start = math.radians(CONFIG.map.initial_heading_deg)
     for _ in range(8):
-        cells.live(Motion(0.1, math.pi / 4, 0.5), None, None)
+        cells.advance(Motion(0.1, math.pi / 4, 0.5), None, None)
     theta = cells.pose.theta_rad
     assert math.cos(theta - start - math.pi) == pytest.approx(1.0)
 
@@ -244,23 +244,23 @@ def view(number, is_new=False, turned=0.0):
 
 def walked(cells, metres, heading=0.0):
     for _ in range(round(metres / 0.05)):
-        cells.live(Motion(0.1, 0.0, 0.5), heading, None)
+        cells.advance(Motion(0.1, 0.0, 0.5), heading, None)
 
 
 @torch.inference_mode()
 def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
     cells = NavigationCells(CONFIG)
-    cells.see(view(0, is_new=True))
+    cells.update_from_view(view(0, is_new=True))
     walked(cells, 0.5)
-    cells.see(view(1, is_new=True))
+    cells.update_from_view(view(1, is_new=True))
     before = cells.pose
-    assert not cells.see(view(0))
+    assert not cells.update_from_view(view(0))
     assert 0.0 <= cells.pose.x_m < before.x_m
-    assert not cells.contradicts(view(0))
+    assert not cells.vetoes(view(0))
     walked(cells, 3.0)
     before = cells.pose
-    assert cells.contradicts(view(0))
-    assert not cells.see(view(0))
+    assert cells.vetoes(view(0))
+    assert not cells.update_from_view(view(0))
     assert cells.pose == before
 
 
@@ -268,10 +268,10 @@ def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
 def test_views_that_agree_carry_the_animal_to_where_they_were_learnt():
     cells = NavigationCells(CONFIG)
     for number in range(8):
-        cells.see(view(number, is_new=True))
+        cells.update_from_view(view(number, is_new=True))
         walked(cells, 0.2)
     walked(cells, 4.0)
-    went = [cells.see(view(k)) for k in range(CONFIG.sessions.confirm)]
+    went = [cells.update_from_view(view(k)) for k in range(CONFIG.sessions.confirm)]
     assert went == [False] * (CONFIG.sessions.confirm - 1) + [True]
     assert cells.pose.x_m == pytest.approx(0.2 * (CONFIG.sessions.confirm - 1), abs=0.2)
     torch.testing.assert_close(
@@ -283,7 +283,7 @@ def test_who_is_set_to_a_place_forgets_doubt_and_keeps_what_it_knows():
     cells = NavigationCells(CONFIG)
     live(cells, sense(walk_in("triangle", 1.0), SenseNoise()))
     n_cells, n_walls = cells.place.n_cells.clone(), cells.walls.n_walls.clone()
-    cells.go_to(Pose(0.3, -0.2, 1.0), 0.1)
+    cells.relocalise(Pose(0.3, -0.2, 1.0), 0.1)
     assert cells.oscillators.position_m.tolist() == [0.3, -0.2]
     assert cells.pose.theta_rad == pytest.approx(1.0)
     assert not cells.familiarity.lost.any()

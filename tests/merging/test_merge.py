@@ -18,10 +18,12 @@ from neuroslam.cells.convolve import Packet
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.mapping.overlap import Pairs, Tolerance, agreeing, n_places
+from neuroslam.merging.mapped import differing_keys
 from neuroslam.merging.match import find_match
-from neuroslam.merging.merge import Match, differing_keys, make_join, merge, merge_states
+from neuroslam.merging.states import make_join, merge_states
 from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
+from neuroslam.state.match import Match
 from neuroslam.state.population import Population
 from neuroslam.state.sessions import Session
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
@@ -116,10 +118,10 @@ def equal(one: NavigationBrain, other: NavigationBrain) -> bool:
 def unchecked(loaded, partial, match):
     """Merge without the check that refuses contradicting maps."""
     state, join = merge_states(
-        loaded.state_dict(), partial.state_dict(), match, partial.config, partial.populations()
+        loaded.state_dict(), partial.state_dict(), match, partial.config, partial.parts()
     )
     merged = NavigationBrain(partial.config)
-    merged.take(state, [])
+    merged.restore(state, [])
     return merged, join
 
 
@@ -197,7 +199,7 @@ def oracle(shared):
 def after(oracle):
     loaded, partial = oracle.brain("loaded", 1), oracle.brain("partial", 2)
     put_packet(partial.pose_cells, PoseEstimate(*oracle.P_z))
-    merged, report = merge(loaded, partial, oracle.match)
+    merged, report = loaded.merge(partial, oracle.match)
     assert merged is not None, report.reason
     return loaded, partial, merged, report
 
@@ -233,7 +235,9 @@ def test_merged_bindings_are_those_of_the_authors_program(oracle, after):
 
 def test_the_matched_experience_comes_to_lie_exactly_on_its_match(oracle, after):
     loaded, partial, _, _ = after
-    join = make_join(loaded.state_dict(), partial.state_dict(), oracle.match, oracle.config)
+    join = make_join(
+        loaded.state_dict(), partial.state_dict(), oracle.match, oracle.config, partial.parts()
+    )
     x, y, heading = join.place(oracle.p_z[None])[0]
     assert [x, y] == oracle.p_u[:2].tolist()
     assert heading == pytest.approx(oracle.p_u[2], rel=0, abs=4.5e-16)  # wrapping rounds it
@@ -251,7 +255,7 @@ def test_a_match_that_is_not_the_last_view_drops_that_view_and_no_other(oracle):
     """The reference would drop view 36 here, and keep view 5 twice."""
     loaded, partial = oracle.brain("loaded", 1), oracle.brain("partial", 2)
     match = Match(3, 5)
-    merged, _ = merge(loaded, partial, match)
+    merged, _ = loaded.merge(partial, match)
     pixels = partial.view.templates["pixels"].numpy()
     kept = np.delete(np.arange(37), partial.map.experiences["template"][5])
     np.testing.assert_array_equal(merged.view.templates["pixels"].numpy()[104:], pixels[kept])
@@ -264,7 +268,7 @@ def test_all_links_of_the_matched_experience_belong_to_its_match(oracle):
     """The authors' program reroutes one of them: a place in mid-session would lose its others."""
     loaded, partial = oracle.brain("loaded", 1), oracle.brain("partial", 2)
     add_links(partial, [(5, 30), (25, 5)])  # besides 4 -> 5 and 5 -> 6: two out, two in
-    merged, _ = merge(loaded, partial, Match(3, 5))
+    merged, _ = loaded.merge(partial, Match(3, 5))
     links, n = merged.map.links, loaded.map.n_links
     source, target = links.source[n:], links.target[n:]
     assert merged.map.n_links == n + partial.map.n_links
@@ -332,13 +336,15 @@ def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corri
             brain(frame)
         lives.append(brain)
     loaded, partial = lives
-    parts = partial.populations()
+    parts = partial.parts()
     assert parts
     assert all(isinstance(part, Population) for part in parts.values())
     for key in partial.state_dict():
         top = key.split(".")[0]
         assert top in parts or top == "stored", key
-    join = make_join(loaded.state_dict(), partial.state_dict(), Match(0, 0), config)
+    join = make_join(
+        loaded.state_dict(), partial.state_dict(), Match(0, 0), config, partial.parts()
+    )
     for part_name, part in parts.items():
         states = [
             {
@@ -351,7 +357,7 @@ def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corri
         merged = part.merged(*states, join)
         assert set(merged) == set(states[0]) == set(states[1]), part_name
         assert {k: v.dtype for k, v in merged.items()} == {k: v.dtype for k, v in states[1].items()}
-    merged, _ = merge(loaded, partial, Match(0, 0))
+    merged, _ = loaded.merge(partial, Match(0, 0))
     assert len(merged.stored) == 2
     assert set(merged.state_dict()) >= set(partial.state_dict())
 
@@ -361,7 +367,7 @@ def test_a_part_without_a_rule_is_named_and_not_forgotten():
     for brain in (a, b):
         brain.hippocampus = nn.BatchNorm1d(2)
     with pytest.raises(MapError, match="hippocampus"):
-        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.populations())
+        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.parts())
 
 
 def test_a_number_beside_all_parts_is_named_and_not_forgotten():
@@ -369,7 +375,7 @@ def test_a_number_beside_all_parts_is_named_and_not_forgotten():
     for brain in (a, b):
         brain.register_buffer("mood", torch.zeros(2))
     with pytest.raises(MapError, match="mood"):
-        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.populations())
+        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.parts())
 
 
 def test_a_rule_that_forgets_a_number_is_named():
@@ -387,7 +393,7 @@ def test_a_rule_that_forgets_a_number_is_named():
     for brain in (a, b):
         brain.olfaction = Forgetful()
     with pytest.raises(MapError, match=r"olfaction has no rule for lost"):
-        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.populations())
+        merge_states(a.state_dict(), b.state_dict(), Match(0, 0), b.config, b.parts())
 
 
 # --- algebra of one match -----------------------------------------------------------------------
@@ -400,7 +406,7 @@ def test_one_match_places_and_renames_everything_and_changes_no_input(seed, u, z
     loaded = synthetic(seed, config=config, shared=True)
     partial = synthetic(seed + 1, config=config, session=2, shared=True)
     before = frozen(loaded), frozen(partial)
-    merged, report = merge(loaded, partial, Match(u, z, turn))
+    merged, report = loaded.merge(partial, Match(u, z, turn))
     assert merged is not None, report.reason
     assert (frozen(loaded), frozen(partial)) == before
 
@@ -417,7 +423,7 @@ def test_one_match_places_and_renames_everything_and_changes_no_input(seed, u, z
             assert torch.equal(now[key][: len(was[key])], was[key]), key
 
     # The match lies on its match: seen with the turn between them.
-    join = make_join(was, partial.state_dict(), Match(u, z, turn), config)
+    join = make_join(was, partial.state_dict(), Match(u, z, turn), config, partial.parts())
     (placed,) = join.place(partial.map.poses[z : z + 1])
     assert placed[:2].tolist() == loaded.map.poses[u, :2].tolist()
     assert abs(wrap_angle(placed[2] - loaded.map.poses[u, 2] - turn)) < 1e-12
@@ -443,7 +449,7 @@ def test_one_match_places_and_renames_everything_and_changes_no_input(seed, u, z
 def test_what_links_measured_stays_true_whatever_heading_their_end_is_told_by(seed, u, z, turn):
     """A link of the matched place is told relative to the heading of what that becomes."""
     loaded, partial = synthetic(seed, shared=True), synthetic(seed + 1, session=2, shared=True)
-    merged, _ = merge(loaded, partial, Match(u, z, turn))
+    merged, _ = loaded.merge(partial, Match(u, z, turn))
     n = loaded.map.n_links
 
     def facing_off(of):
@@ -596,7 +602,7 @@ def test_places_folded_together_keep_one_view_each_and_every_link_once(seed, n_p
 @few
 def test_what_comes_out_is_sound(seed, turn):
     loaded, partial = synthetic(seed, shared=True), synthetic(seed + 1, session=2, shared=True)
-    merged, _ = merge(loaded, partial, Match(1, 2, turn))
+    merged, _ = loaded.merge(partial, Match(1, 2, turn))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "brain.safetensors"
         save_brain(merged, file)
@@ -702,7 +708,7 @@ def test_a_brain_merged_with_itself_is_that_brain(seed, panoramic):
     brain = synthetic(seed, config=small(panoramic=panoramic), shared=True)
     found = find_match(brain, brain)
     assert len(found.match.pairs.partial) == brain.map.n
-    merged, report = merge(brain, brain, found.match)
+    merged, report = brain.merge(brain, found.match)
     assert merged is not None, report.reason
     assert "nothing is new" in report.reason
     was, is_now = brain.state_dict(), merged.state_dict()
@@ -745,7 +751,7 @@ def test_two_halves_of_a_life_that_overlap_are_that_life(ellipse):
     first, second = lived(ellipse[:200]), lived(ellipse[cut:])
     found = find_match(first, second)
     assert found.match is not None, found.reason
-    merged, report = merge(first, second, found.match)
+    merged, report = first.merge(second, found.match)
     assert merged is not None, report.reason
     assert (merged.view.n, merged.map.n) == (whole.view.n, whole.map.n)
     assert merged.map.n_links == whole.map.n_links
@@ -758,7 +764,7 @@ def test_two_halves_of_a_life_that_overlap_are_that_life(ellipse):
 def test_a_life_and_the_copy_that_went_on_are_the_life_that_went_on(ellipse):
     copy, whole = lived(ellipse[:200]), lived(ellipse)
     for one, other in ((copy, whole), (whole, copy)):
-        merged, _ = merge(one, other, find_match(one, other).match)
+        merged, _ = one.merge(other, find_match(one, other).match)
         for part in ("view", "map"):
             assert getattr(merged, part).n == getattr(whole, part).n
         assert merged.map.n_links == whole.map.n_links
@@ -802,7 +808,7 @@ def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(
     before = frozen(first), frozen(second)
     beside = found.partial + 1  # a link away, and said to be a place metres away
     wrong = found._replace(others=Pairs.of([(beside, far, 0.0, 0.01)]))
-    merged, report = merge(first, second, wrong)
+    merged, report = first.merge(second, wrong)
     assert merged is None
     assert not report.merged
     assert said in report.reason
@@ -817,7 +823,7 @@ def test_an_open_arc_is_not_closed_by_one_wrong_pair(ellipse):
     first, second = lived(ellipse[:150]), lived(ellipse[100:250])
     found = find_match(first, second).match
     arc = found._replace(others=Pairs.of([(second.map.n - 1, 0, 0.0, 0.01)]))
-    merged, report = merge(first, second, arc)
+    merged, report = first.merge(second, arc)
     assert merged is None
     assert "cannot be the same" in report.reason
 
@@ -826,7 +832,7 @@ def test_maps_made_with_other_views_or_cells_are_refused_and_the_keys_named():
     a = synthetic(1)
     b = synthetic(2, config=small(threshold=0.04), session=2)
     assert differing_keys(a.config, b.config) == ["view.threshold is 0.05 and 0.04"]
-    merged, report = merge(a, b, Match(0, 0))
+    merged, report = a.merge(b, Match(0, 0))
     assert merged is None
     assert "view.threshold is 0.05 and 0.04" in report.reason
     assert "view.threshold is 0.05 and 0.04" in find_match(a, b).reason
@@ -843,7 +849,7 @@ def test_maps_made_with_other_views_or_cells_are_refused_and_the_keys_named():
 )
 def test_a_match_that_names_a_missing_place_is_a_mistake_that_is_named(match, which):
     with pytest.raises(MapError, match=which):
-        merge(synthetic(1), synthetic(2, session=2), match)
+        synthetic(1).merge(synthetic(2, session=2), match)
 
 
 def test_an_empty_map_meets_nothing():

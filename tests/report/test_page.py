@@ -302,7 +302,7 @@ def test_it_prints_in_light_colours_on_a_few_pages(show, runs):
 def streets(out: Path, n_places: int) -> None:
     """A walk through streets: so many places, and what a run of it would have written."""
     rng, brain = np.random.default_rng(0), NavigationBrain(BrainConfig())
-    brain._name_session(Frame(0, 0.0), brain._sense(Frame(0, 0.0)))
+    brain._name_session(Frame(0, 0.0), {})
     ways, corner = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)]), 20
     at, way, known, frame = np.zeros(2, int), 0, {}, 0
     side = corner * (int(np.sqrt(n_places / (3 * corner))) + 1)

@@ -17,7 +17,7 @@ import torch
 
 from neuroslam import load_brain, run
 from neuroslam.cli import main
-from neuroslam.merging.merge import MergeReport
+from neuroslam.merging.report import MergeReport
 from neuroslam.runs import plot
 from neuroslam.runs.files import RUN_FILES, RunPlan
 from neuroslam.runs.reading import read_frames

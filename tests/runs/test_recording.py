@@ -13,7 +13,7 @@ from neuroslam.errors import RunError
 from neuroslam.runs.recording import (
     NullRecorder,
     TensorBoardRecorder,
-    activity_picture,
+    coloured,
     frame_beside_template,
 )
 from neuroslam.sensors import open_source
@@ -246,7 +246,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
 def test_in_the_picture_of_the_cells_up_is_y_and_heading():
     activity = np.zeros((36, 21, 21), np.float32)
     activity[27, 20, 0] = 1.0  # at the top left from above; at three quarters of the height aside
-    picture = activity_picture(activity)
+    picture = coloured((activity.sum(0), activity.sum(1)))
     yellow = picture[..., 0] > 200
     rows, columns = np.nonzero(yellow[:, :210])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (0, 9, 0, 9)
@@ -256,7 +256,8 @@ def test_in_the_picture_of_the_cells_up_is_y_and_heading():
 
 
 def test_a_large_torus_and_silent_cells_are_drawn_too():
-    assert activity_picture(np.zeros((36, 80, 80), np.float32)).shape == (240, 488, 3)
+    silent = np.zeros((80, 80)), np.zeros((36, 80))
+    assert coloured(silent).shape == (240, 488, 3)
 
 
 @pytest.mark.parametrize("shape", [(48, 64), (720, 1280, 3), (30, 360)])
