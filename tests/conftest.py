@@ -1,5 +1,6 @@
 """Fixtures that several test files share."""
 
+import multiprocessing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,6 +21,19 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip("no ../shared beside the checkout: real data and references are kept there")
     return folder
+
+
+@pytest.fixture
+def forked(monkeypatch):
+    """Fork the processes of ``--jobs`` from one that has loaded torch, which each else loads anew.
+
+    That they can start from nothing, as they do elsewhere, is for ``test_parallel.py``.
+    """
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["neuroslam.sweeps", "neuroslam.fleets"])
+        starts = SimpleNamespace(get_context=lambda _how: context)
+        monkeypatch.setattr("neuroslam.parallel.multiprocessing", starts)
 
 
 @pytest.fixture
