@@ -7,11 +7,17 @@ from types import SimpleNamespace
 import cv2
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from neuroslam.cli import main
 
 torch.set_num_threads(1)
 cv2.setNumThreads(1)
+# How long an example takes is the machine's affair.
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")
