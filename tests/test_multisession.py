@@ -20,7 +20,7 @@ def opened():
     @cache
     def open_once(spec, frame_rate_hz=20.0):
         source = open_source(spec, frame_rate_hz)
-        if spec.startswith("world:"):
+        if str(spec).startswith("world:"):
             source.frame = cache(source.frame)
         return source
 
