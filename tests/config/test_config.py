@@ -193,9 +193,9 @@ def test_a_world_reads_the_old_name_of_an_option_with_a_warning():
     with pytest.warns(RenamedKeyWarning, match="carried is called kidnapped now"):
         old = open_source("world:corridor?laps=1&frames_per_lap=60&carried=2:0.5")
     new = open_source("world:corridor?laps=1&frames_per_lap=60&kidnapped=2:0.5")
-    np.testing.assert_array_equal(old.truth(), new.truth())
+    np.testing.assert_array_equal(old.truths(), new.truths())
     still = open_source("world:corridor?laps=1&frames_per_lap=60")
-    assert not np.array_equal(old.truth(), still.truth())
+    assert not np.array_equal(old.truths(), still.truths())
 
 
 # --- parameters that must agree -----------------------------------------------------------------
