@@ -88,7 +88,7 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
     out = tmp_path / "deep" / "out"
     done = call("merge", runs / "a", runs / "b", "-o", out)
     assert (done.code, done.err) == (0, "")
-    assert re.search(r"^merged: \d+ places are new$", done.out, re.MULTILINE)
+    assert re.search(r"^merged: \d+ experiences are new$", done.out, re.MULTILINE)
     assert done.out.endswith(f"Written: {out}\n")
     assert {path.name for path in out.iterdir()} == set(RUN_FILES)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
