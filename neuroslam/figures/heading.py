@@ -1,6 +1,6 @@
 """Figures of head-direction and speed cells: tuning, the bump over time, drift, rates.
 
-Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.plotting.save` writes it.
+Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.style.save` writes it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -18,7 +18,9 @@ function tableOf(names, rows) {
     make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
 }
 
-const BEGAN = { start: "the run", carried: "the robot was carried", gap: "a gap in the frames" };
+const CARRIED = "the robot was carried";
+// Files written before the word was kidnapped say carried.
+const BEGAN = { start: "the run", kidnapped: CARRIED, carried: CARRIED, gap: "a gap in the frames" };
 
 function startSessions() {
   const list = $("session-list"), places = new Array(about.sessions.length).fill(0);

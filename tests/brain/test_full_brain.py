@@ -369,7 +369,7 @@ def test_a_merge_of_two_sessions_is_the_union_of_all_that_they_know(cells, sessi
     n = report.counts["experiences"]
     assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     if "place" in cells:
-        n = report.counts["place cells"]
+        n = report.counts["place_cells"]
         assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     one, other = loaded.semantic.landmarks(), merged.semantic.landmarks()
     order = np.argsort(one["number"]), np.argsort(other["number"])

@@ -16,6 +16,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 
+from neuroslam.brain import load_brain
 from neuroslam.cli import main, output
 from neuroslam.config import preset_names
 from neuroslam.runs.inspect import inspect
@@ -505,6 +506,19 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
     assert "error against the truth" in error
     assert written == f"Written: {out}"
+
+
+def test_an_old_name_of_a_key_is_read_and_told_in_one_line(tmp_path, call):
+    out = tmp_path / "run"
+    done = call("run", WORLD, "-o", out, "--stop", 3, QUICK, "--set", "sessions.carried=ignore")
+    assert done.code == 0
+    assert done.err == (
+        "neuroslam run: note: sessions: carried is called kidnapped now; the old name is read "
+        "until the next release\n"
+    )
+    assert load_brain(out / "brain.safetensors").config.sessions.kidnapped == "ignore"
+    again = call("resume", out, QUICK)
+    assert (again.code, again.err) == (0, "")  # what was written has the new name
 
 
 def test_one_is_told_in_the_singular(tmp_path, call):
