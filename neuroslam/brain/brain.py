@@ -29,6 +29,7 @@ from neuroslam.sensors.frames import (
     checked_number,
     checked_odometry,
 )
+from neuroslam.state.answers import moves_others
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, State
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
@@ -254,7 +255,7 @@ class NavigationBrain(nn.Module):
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Let the map and all populations follow corrections, but for their authors."""
-        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
         leader = self.leader

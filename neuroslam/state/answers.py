@@ -91,18 +91,20 @@ def tables_of(population: Population) -> dict[str, str]:
     return dict(tables)
 
 
-def checked_correction(population: Population, hook: str, answer: object) -> Correction | None:
-    """Return what a hook has returned, if it is a correction or nothing.
+def moves_others(population: Population | None, correction: Correction | None) -> bool:
+    """Tell whether others have to follow what ``step`` or ``recall`` has returned.
 
     Raises:
-        TypeError: If it is anything else.
+        TypeError: If that is neither a correction nor ``None``.
     """
-    if answer is None or isinstance(answer, Correction):
-        return answer
-    raise TypeError(
-        f"{_who(population)}.{hook}(): returned {type(answer).__name__}, expected a Correction or "
-        "None"
-    )
+    if correction is None:
+        return False
+    if not isinstance(correction, Correction):
+        raise TypeError(
+            f"{type(population).__name__}: step() or recall() returned "
+            f"{type(correction).__name__}, expected a Correction or None"
+        )
+    return not correction.is_nothing
 
 
 def _numbers(population: Population, hook: str, answer: object) -> dict[str, float]:

@@ -61,6 +61,7 @@ def register(kind: str) -> Callable[[Kind], Kind]:
             if kind not in HOMES:  # the tests look at the package's own: imports stay quick
                 _check_name(cls)
                 _check_section(cls)
+                _check_lead(cls)
                 _check_empty(cls)
         except ConfigError:
             del registered[kind]
@@ -117,6 +118,17 @@ def _check_section(cls: type[Population]) -> None:
             f"{what}: {section.__name__} has no defaults ({first_line(error)}); every parameter "
             "needs one"
         ) from error
+
+
+def _check_lead(cls: type[Population]) -> None:
+    """Refuse a leader that does not say what only it knows."""
+    hooks = ("decide", "belief", "estimate")
+    lacks = [hook for hook in hooks if getattr(cls, hook) is getattr(Population, hook)]
+    if cls.rank > 0 and lacks:
+        raise ConfigError(
+            f"@register({cls.kind!r}): has rank {cls.rank}, but no {', '.join(lacks)}; define what "
+            "a leader needs, or leave rank at 0"
+        )
 
 
 def _check_empty(cls: type[Population]) -> None:
