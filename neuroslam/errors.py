@@ -39,6 +39,12 @@ def counted(n: int, one: str, several: str = "") -> str:
     return f"{n:,} {one if n == 1 else several or one + 's'}"
 
 
+def first_line(error: Exception) -> str:
+    """Return the line of a long error that says what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[1] if len(lines) > 1 and lines[0].endswith(":") else (lines or ["?"])[0]
+
+
 class RenamedKeyWarning(FutureWarning):
     """A config key or option that is called otherwise now; the old name is read for one release."""
 

@@ -16,6 +16,7 @@ from neuroslam.sensors.frames import (
     checked_number,
     checked_odometry,
 )
+from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
 from neuroslam.state.sessions import Session, session_id
 from neuroslam.types import (
@@ -165,7 +166,7 @@ class NavigationBrain(BrainState):
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Let the map and all populations follow corrections, but for their authors."""
-        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
         leader = self.leader

@@ -68,6 +68,12 @@ def _with_hint(section: type[BaseModel], told: Mapping[str, Any]) -> InitErrorDe
         _, hinted, meant = said.partition("; did you mean ")
         own = str(told["loc"][0]) in section.model_fields or len(told["loc"]) == 1
         hint = _key_meant(section, key) if own else hinted + meant  # of a population's section
+        if (
+            not hint
+            and isinstance(told["input"], Mapping)
+            and section.model_config["extra"] == "allow"
+        ):
+            hint = "; if it is a section of your own population, give its file with --plugin FILE"
         kind, said = "unknown_key", f"unknown key {key!r}{hint}"
     elif kind == "literal_error" and "did you mean" not in said:
         said += _choice_meant(told)
