@@ -9,6 +9,7 @@ colour-blind readers can tell apart.
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -38,7 +39,7 @@ _EAST_ASIAN = (
 )  # fmt: skip
 _THERE = set(fontManager.get_font_names())
 
-STYLE = {
+STYLE: dict[Any, Any] = {  # names of matplotlib's settings -> values
     "font.family": ["DejaVu Sans", *(name for name in _EAST_ASIAN if name in _THERE)],
     "font.size": 9,
     "axes.titlesize": 10,
@@ -137,7 +138,8 @@ def save(figure: Figure, path: Path, dpi: int = 150) -> None:
 def render(figure: Figure, dpi: int = 100) -> np.ndarray:
     """Draw a figure into pixels: ``uint8``, ``(h, w, 3)``."""
     figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
     with mpl.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")
-        figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
