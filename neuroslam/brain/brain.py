@@ -24,8 +24,8 @@ from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import Profiles, VisualOdometry
 from neuroslam.sensors.frames import (
+    check_image,
     check_instant,
-    check_picture,
     checked_number,
     checked_odometry,
 )
@@ -214,7 +214,7 @@ class NavigationBrain(nn.Module):
             if self._has_compass and frame.heading_rad is not None:
                 checked_number(frame.heading_rad, "heading", "rad")
             if frame.image is not None:
-                check_picture(frame.image)
+                check_image(frame.image)
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None

@@ -1,6 +1,6 @@
-"""Visual odometry: how fast the robot drives and turns, from two pictures in a row.
+"""Visual odometry: how fast the robot drives and turns, from two images in a row.
 
-Turning to the left moves the picture to the right: see ``docs/sign_conventions.md``.
+Turning to the left moves the image to the right: see ``docs/sign_conventions.md``.
 """
 
 import math
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuroslam.config.sections import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.sensors.frames import check_picture
+from neuroslam.sensors.frames import check_image
 from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
@@ -59,7 +59,7 @@ def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tup
         max_shift: :math:`S`, at most ``n``.
 
     Returns:
-        The offset :math:`s` of the smallest :math:`d`, positive where the picture moved to the
+        The offset :math:`s` of the smallest :math:`d`, positive where the image moved to the
         right, and that :math:`d`. Of equal ones the first in the order 0, -1, ..., -(S-1), 1, ...,
         S-1 is taken. Sums of integers are exact, so equal ones are found to be equal.
 
@@ -103,8 +103,8 @@ def motion_from_match(
     Args:
         shift_px: Offset :math:`s` of the turn region, to the right positive.
         difference: Smallest difference :math:`d` in the speed region, grey in [0, 1].
-        image_width: Of the whole picture, in px.
-        dt_s: Time between the pictures in seconds.
+        image_width: Of the whole image, in px.
+        dt_s: Time between the images in seconds.
         config: Field of view, scale :math:`c` and bounds of the speed.
 
     Example:
@@ -118,7 +118,7 @@ def motion_from_match(
 
 
 class Profiles(NamedTuple):
-    """Size of a picture in px, and the column sums of its speed and turn region."""
+    """Size of an image in px, and the column sums of its speed and turn region."""
 
     height: int
     width: int
@@ -127,16 +127,16 @@ class Profiles(NamedTuple):
 
 
 class VisualOdometry(AboutNow):
-    """Measures motion by matching each picture with the one before it.
+    """Measures motion by matching each image with the one before it.
 
-    The column sums of the last picture's two regions are buffers, so ``state_dict`` is complete.
+    The column sums of the last image's two regions are buffers, so ``state_dict`` is complete.
 
     Example:
         >>> odometry = VisualOdometry(OdometryConfig(max_shift_px=4))
-        >>> picture = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
-        >>> odometry(picture, dt_s=0.1)  # the first: nothing to compare it with
+        >>> image = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
+        >>> odometry(image, dt_s=0.1)  # the first: nothing to compare it with
         Velocity(v_m_s=0.0, w_rad_s=0.0)
-        >>> odometry(np.roll(picture, 2, axis=1), dt_s=0.1).w_rad_s > 0  # right: it turned left
+        >>> odometry(np.roll(image, 2, axis=1), dt_s=0.1).w_rad_s > 0  # right: it turned left
         True
     """
 
@@ -146,39 +146,39 @@ class VisualOdometry(AboutNow):
     def __init__(self, config: OdometryConfig) -> None:
         super().__init__()
         self.config = config
-        self.size = Scalars(height=0, width=0)  # zero before the first picture
+        self.size = Scalars(height=0, width=0)  # zero before the first image
         self._regions: tuple[Region, Region] | None = None  # follow from the config and the size
         self.register_buffer("speed_sums", torch.zeros(0, dtype=torch.int32))
         self.register_buffer("turn_sums", torch.zeros(0, dtype=torch.int32))
         self.register_load_state_dict_pre_hook(_resize_to_saved)
 
     def forward(self, image: np.ndarray, dt_s: float) -> Velocity:
-        """Compare a picture with the one before it and remember it.
+        """Compare an image with the one before it and remember it.
 
         Args:
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-            dt_s: Time since the previous picture in seconds.
+            dt_s: Time since the previous image in seconds.
 
         Raises:
-            ConfigError: If a region does not lie in the picture, or is too narrow for the offsets.
-            BadFrame: If the picture is not of the size and kind of those before, or no time passed.
+            ConfigError: If a region does not lie in the image, or is too narrow for the offsets.
+            BadFrame: If the image is not of the size and kind of those before, or no time passed.
         """
         velocity, profiles = self.measure(image, dt_s)
         self.remember(profiles)
         return velocity
 
     def measure(self, image: np.ndarray, dt_s: float) -> tuple[Velocity, Profiles]:
-        """Compare a picture with the one before it; nothing changes. See :meth:`forward`."""
+        """Compare an image with the one before it; nothing changes. See :meth:`forward`."""
         if not dt_s > 0.0:
-            raise BadFrame(f"VisualOdometry: {dt_s} s since the last picture; expected more than 0")
-        check_picture(image, "VisualOdometry")
+            raise BadFrame(f"VisualOdometry: {dt_s} s since the last image; expected more than 0")
+        check_image(image, "VisualOdometry")
         if image.ndim == 3:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         height, width = image.shape
         first = self.size.height == 0
         if not first and (height, width) != (self.size.height, self.size.width):
             raise BadFrame(
-                f"VisualOdometry: picture is {width} x {height} px; expected "
+                f"VisualOdometry: image is {width} x {height} px; expected "
                 f"{self.size.width} x {self.size.height} px as before it"
             )
         if self._regions is None:
@@ -198,7 +198,7 @@ class VisualOdometry(AboutNow):
         return motion_from_match(shift, difference, width, dt_s, self.config), now
 
     def remember(self, profiles: Profiles) -> None:
-        """Keep the profiles of a picture for the comparison with the next."""
+        """Keep the profiles of an image for the comparison with the next."""
         if self.size.height == 0:
             self.size.height, self.size.width = profiles.height, profiles.width
         # By way of _buffers: setting an attribute of a module costs more than matching a profile.
@@ -208,10 +208,10 @@ class VisualOdometry(AboutNow):
 
 
 def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region, Region]:
-    """Return the speed and the turn region of a picture: the config's, or its lower, upper half.
+    """Return the speed and the turn region of an image: the config's, or its lower, upper half.
 
     Raises:
-        ConfigError: If a region does not lie in the picture, or is narrower than ``max_shift_px``.
+        ConfigError: If a region does not lie in the image, or is narrower than ``max_shift_px``.
 
     Example:
         >>> regions_in(120, 160, OdometryConfig())
@@ -226,7 +226,7 @@ def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region,
         x_min, x_max, y_min, y_max = region
         if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
             raise ConfigError(
-                f"odometry.{name} = {list(region)} does not lie in a picture of {width} x {height} "
+                f"odometry.{name} = {list(region)} does not lie in an image of {width} x {height} "
                 "px; expected x_min, x_max, y_min, y_max inside it"
             )
         if x_max - x_min < config.max_shift_px:

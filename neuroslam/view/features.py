@@ -1,4 +1,4 @@
-"""From a picture to a template by a network: its features in place of grey, column by column."""
+"""From an image to a template by a network: its features in place of grey, column by column."""
 
 import difflib
 import hashlib
@@ -19,25 +19,25 @@ from torch.nn.functional import interpolate, pad
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.sensors.frames import check_picture
+from neuroslam.sensors.frames import check_image
 from neuroslam.state.files import first_line, tensors_digest
 from neuroslam.view import vision
 from neuroslam.view.preprocess import Encoded, crop, encode
 
 Encoder = Callable[[np.ndarray], Encoded]
-"""Makes the template of a picture."""
+"""Makes the template of an image."""
 
-_SIDE_PX = 224  # shorter side of the pictures that networks of torchvision were trained on
+_SIDE_PX = 224  # shorter side of the images that networks of torchvision were trained on
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # and how these were normalised
-_SMALL_PX = (32, 24)  # contrast is that of a small picture: noise of pixels shows nothing
+_SMALL_PX = (32, 24)  # contrast is that of a small image: noise of pixels shows nothing
 
 
 class FeatureEncoder:
-    r"""Makes the template of a picture from the features that a network finds in it.
+    r"""Makes the template of an image from the features that a network finds in it.
 
     The network gives a map of features, ``(1, channels, rows, columns)``. All features of a column
-    of the picture are one vector, scaled to length 1, and the template holds its components along
-    ``template_height`` random directions, the same for every picture:
+    of the image are one vector, scaled to length 1, and the template holds its components along
+    ``template_height`` random directions, the same for every image:
 
     .. math:: v_{\cdot j} = \operatorname{clip}\!\left(\tfrac{1}{6} P\,
               \tfrac{f_j}{\lVert f_j \rVert} + \tfrac{1}{2},\, 0,\, 1\right),
@@ -53,7 +53,7 @@ class FeatureEncoder:
     Args:
         config: ``features`` and ``weights`` name the network; crop and size of the template.
         network: In place of a named one, where ``features`` is ``"module"``: takes RGB in [0, 1],
-            ``float32``, ``(1, 3, h, w)``. It is set to evaluation and keeps no gradients; a picture
+            ``float32``, ``(1, 3, h, w)``. It is set to evaluation and keeps no gradients; an image
             is taken to the device that it is on.
 
     Raises:
@@ -101,16 +101,16 @@ class FeatureEncoder:
         return int.from_bytes(hashlib.sha256(told.encode()).digest()[:7]) + 1
 
     def __call__(self, image: np.ndarray) -> Encoded:
-        """Make the template of a picture.
+        """Make the template of an image.
 
         Args:
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
 
         Raises:
-            BadFrame: If the picture is of another type or shape, or its features not finite.
-            ConfigError: If the crop leaves the picture, or the network gives no features.
+            BadFrame: If the image is of another type or shape, or its features not finite.
+            ConfigError: If the crop leaves the image, or the network gives no features.
         """
-        check_picture(image, "LocalViewCells")
+        check_image(image, "LocalViewCells")
         config = self.config
         image = crop(image, config.crop)
         rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
@@ -138,7 +138,7 @@ class FeatureEncoder:
                 found = self.network(x.to(next(weights, x)))  # to their device and precision
         except (RuntimeError, ValueError, TypeError, AssertionError, LookupError) as error:
             raise ConfigError(
-                f"view.features = {name!r}: the network fails on a picture of "
+                f"view.features = {name!r}: the network fails on an image of "
                 f"{x.shape[-1]}x{x.shape[-2]} px ({first_line(error)})"
             ) from None
         fits = isinstance(found, Tensor) and found.is_floating_point()
@@ -150,7 +150,7 @@ class FeatureEncoder:
             )
         if found.ndim == 2 and (config.panoramic or config.shift_match):
             raise ConfigError(
-                f"view.features = {name!r}: the network gives one vector for a picture, which "
+                f"view.features = {name!r}: the network gives one vector for an image, which "
                 "cannot be shifted; set view.shift_match = 0 and view.panoramic = false"
             )
         if not torch.isfinite(found).all():
@@ -159,7 +159,7 @@ class FeatureEncoder:
 
 
 def view_encoder(config: ViewConfig, features: nn.Module | Encoder | None = None) -> Encoder:
-    """Return what makes templates of pictures: grey, or the features of a network.
+    """Return what makes templates of images: grey, or the features of a network.
 
     Args:
         config: Says which.

@@ -1,4 +1,4 @@
-"""From a picture to a template: grey, crop, block mean, mean and patch normalisation."""
+"""From an image to a template: grey, crop, block mean, mean and patch normalisation."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -8,11 +8,11 @@ import numpy as np
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError
-from neuroslam.sensors.frames import check_picture
+from neuroslam.sensors.frames import check_image
 
 
 class Encoded(NamedTuple):
-    """A picture as a template.
+    """An image as a template.
 
     Attributes:
         template: Grey in [0, 1], ``float64``, shape ``(template_height, template_width)``.
@@ -24,25 +24,25 @@ class Encoded(NamedTuple):
 
 
 def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
-    """Make the template of a picture.
+    """Make the template of an image.
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
         config: Crop, size and normalisations.
 
     Raises:
-        BadFrame: If the picture is of another type or shape.
-        ConfigError: If the crop leaves the picture, or is smaller than the template.
+        BadFrame: If the image is of another type or shape.
+        ConfigError: If the crop leaves the image, or is smaller than the template.
 
     Example:
-        >>> picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
+        >>> image = np.arange(48, dtype=np.uint8).reshape(6, 8)
         >>> config = ViewConfig(
         ...     template_width=4, template_height=3, shift_match=1, normalisation=0
         ... )
-        >>> (encode(picture, config).template[0] * 255).tolist()
+        >>> (encode(image, config).template[0] * 255).tolist()
         [4.5, 6.5, 8.5, 10.5]
     """
-    check_picture(image, "LocalViewCells")
+    check_image(image, "LocalViewCells")
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
@@ -55,10 +55,10 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
 
 
 def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:
-    """Cut ``x_min, x_max, y_min, y_max`` out of a picture; ``None`` takes all of it.
+    """Cut ``x_min, x_max, y_min, y_max`` out of an image; ``None`` takes all of it.
 
     Raises:
-        ConfigError: If the region leaves the picture.
+        ConfigError: If the region leaves the image.
     """
     if region is None:
         return image
@@ -66,8 +66,8 @@ def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndar
     height, width = image.shape[:2]
     if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
         raise ConfigError(
-            f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the picture "
-            f"of {width}x{height} px; change it, or leave it out to take the whole picture"
+            f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the image "
+            f"of {width}x{height} px; change it, or leave it out to take the whole image"
         )
     return image[y_min:y_max, x_min:x_max]
 
@@ -78,14 +78,14 @@ def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
     Sums are of integers, so they are exact; each is divided once.
 
     Raises:
-        ConfigError: If the picture is smaller than that.
+        ConfigError: If the image is smaller than that.
     """
     h, w = image.shape
     block_h, block_w = h // height, w // width
     if not block_h or not block_w:
         raise ConfigError(
             f"view.template_width x template_height = {width}x{height} is larger than the "
-            f"cropped picture of {w}x{h} px; make the template smaller or the crop larger"
+            f"cropped image of {w}x{h} px; make the template smaller or the crop larger"
         )
     blocks = image[: height * block_h, : width * block_w].reshape(height, block_h, -1)
     rows = np.add.reduce(blocks, axis=1, dtype=np.uint32)

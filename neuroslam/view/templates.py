@@ -1,4 +1,4 @@
-"""Local view cells: which stored view does a picture show, and is it a new one?"""
+"""Local view cells: which stored view does an image show, and is it a new one?"""
 
 import numpy as np
 import torch
@@ -48,8 +48,8 @@ class LocalViewCells(Mergeable):
 
     Example:
         >>> cells = LocalViewCells(ViewConfig(template_width=16, template_height=8, shift_match=2))
-        >>> picture = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
-        >>> cells(picture).is_new, cells(picture).template
+        >>> image = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
+        >>> cells(image).is_new, cells(image).template
         (True, 0)
     """
 
@@ -88,11 +88,11 @@ class LocalViewCells(Mergeable):
         return self.encoder.__dict__.get("digest", 0)  # a cached property: loads nothing
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Make the template of a picture: in [0, 1], ``(template_height, template_width)``.
+        """Make the template of an image: in [0, 1], ``(template_height, template_width)``.
 
         Raises:
-            BadFrame: If the picture is not ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-            ConfigError: If crop and template do not fit the picture, or a network that is to make
+            BadFrame: If the image is not ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
+            ConfigError: If crop and template do not fit the image, or a network that is to make
                 it cannot be loaded, or is not the one that made the templates.
         """
         return self._encode(image).template
@@ -117,7 +117,7 @@ class LocalViewCells(Mergeable):
         return self.encoder(image)
 
     def template_image(self, template: int) -> np.ndarray:
-        """Return a template as a grey picture, ``uint8``, ``(template_height, template_width)``.
+        """Return a template as a grey image, ``uint8``, ``(template_height, template_width)``.
 
         Raises:
             MapError: If there is no such template.
@@ -189,28 +189,28 @@ class LocalViewCells(Mergeable):
         return ViewMatch(found.id, error, self._relative_heading(found.shift), False)
 
     def forward(self, image: np.ndarray) -> ViewMatch:
-        """Recognise a picture, or store it as a new template.
+        """Recognise an image, or store it as a new template.
 
         Args:
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
 
         Returns:
-            The match; ``NO_TEMPLATE`` if the picture has too little contrast to show anything. The
+            The match; ``NO_TEMPLATE`` if the image has too little contrast to show anything. The
             error of a new view among thousands is that of a near template, not surely the nearest.
 
         Raises:
-            BadFrame: If the picture is of another type or shape.
-            ConfigError: If crop and template do not fit the picture.
+            BadFrame: If the image is of another type or shape.
+            ConfigError: If crop and template do not fit the image.
         """
         view = self.look(image)
         return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False) if view is None else self.recognise(view)
 
     def look(self, image: np.ndarray) -> np.ndarray | None:
-        """Make the template of a picture, as :meth:`encode`; ``None`` if it shows nothing.
+        """Make the template of an image, as :meth:`encode`; ``None`` if it shows nothing.
 
         Raises:
-            BadFrame: If the picture is of another type or shape.
-            ConfigError: If crop and template do not fit the picture.
+            BadFrame: If the image is of another type or shape.
+            ConfigError: If crop and template do not fit the image.
         """
         view, contrast = self._encode(image)
         return None if contrast < self.config.min_contrast else view
