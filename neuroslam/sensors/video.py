@@ -34,8 +34,6 @@ class VideoSource(Source):
         SourceError: If the file is not a video or has no frames.
     """
 
-    frame_rate_hz: float  # pyright: ignore[reportIncompatibleVariableOverride] - always known
-
     def __init__(self, path: Path, frame_rate_hz: float) -> None:
         self.path = Path(path)
         self.name = str(path)
@@ -49,7 +47,8 @@ class VideoSource(Source):
                 f"{self.name}: no frame can be decoded; expected a complete video file"
             )
         self.image_shape = image.shape[:2]
-        self.frame_rate_hz = fps if math.isfinite(fps) and fps > 0 else frame_rate_hz
+        self._rate_hz = fps if math.isfinite(fps) and fps > 0 else frame_rate_hz
+        self.frame_rate_hz = self._rate_hz
         is_counted = self.path.suffix.lower() in _COUNTED and count > 0
         self.n_frames = int(count) if is_counted else None
 
@@ -95,7 +94,7 @@ class VideoSource(Source):
             raise BadFrame(f"{self.name}: frame {index} cannot be decoded")
         require_shape(image[..., 0], self.image_shape, self.name, index)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        return Frame(index, index / self.frame_rate_hz, image=grey)
+        return Frame(index, index / self._rate_hz, image=grey)
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:

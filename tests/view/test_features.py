@@ -148,9 +148,9 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
     [
         ("squeezenet1_1", "none.pth", "no such file"),
         ("squeezenet1_1", "text.pth", "cannot be read; expected the state_dict"),
-        ("squeezenet1_1", "list.pth", "holds no state_dict"),
-        ("squeezenet9", "squeezenet.pth", "near it are squeezenet1_1"),
-        ("squeezenet1_1.features.77", "squeezenet.pth", "its parts are features, classifier"),
+        ("squeezenet1_1", "list.pth", "contains no state_dict"),
+        ("squeezenet9", "squeezenet.pth", "similar names: squeezenet1_1"),
+        ("squeezenet1_1.features.77", "squeezenet.pth", "after its name: features, classifier"),
         ("resnet18", "squeezenet.pth", "not of resnet18"),
     ],
 )
@@ -187,10 +187,10 @@ class Gives(nn.Module):
 @pytest.mark.parametrize(
     ("found", "error", "said"),
     [
-        (torch.zeros(1, 4, 5), ConfigError, r"gives \(1, 4, 5\); expected features"),
-        ({"out": 1}, ConfigError, "gives dict; expected features"),
+        (torch.zeros(1, 4, 5), ConfigError, r"returns \(1, 4, 5\); expected features"),
+        ({"out": 1}, ConfigError, "returns dict; expected features"),
         (torch.zeros(1, 4, 3, 5, dtype=torch.int64), ConfigError, "expected features"),
-        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "not all finite"),
+        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "are not finite"),
         (nn.Conv2d(3, 4, 200), ConfigError, "fails on an image of 96x64 px"),
     ],
 )
@@ -243,7 +243,9 @@ def test_a_brain_says_which_network_it_needs(tour, tmp_path):
     brain = lived(tour[:50], filters())
     save_brain(brain, path)
     assert load_brain(path).map.n == brain.map.n  # to look at it, no network is needed
-    with pytest.raises(ConfigError, match=r"none was passed; pass it .*load_brain\(path, feat"):
+    with pytest.raises(
+        ConfigError, match=r"no network was passed; pass it .*load_brain\(path, feat"
+    ):
         load_brain(path)(tour[50])
     with pytest.raises(ConfigError, match="views of the map were made with other weights"):
         load_brain(path, features=filters(seed=1))(tour[50])
@@ -310,7 +312,7 @@ def weights_of(name, folder):
 def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(tmp_path):
     path = weights_of("swin_t", tmp_path)
     assert load_network("swin_t", path)(torch.rand(1, 3, 96, 192)).shape == (1, 768, 7, 14)
-    with pytest.raises(ConfigError, match=r"channels last; name swin_t\.permute"):
+    with pytest.raises(ConfigError, match=r"channels last; use swin_t\.permute"):
         load_network("swin_t.features", path)
 
 
