@@ -1,4 +1,4 @@
-"""Which populations there are, by kind: the package's own, installed ones, and those of a file."""
+"""Known populations by kind: the package's own, installed ones, and those of plugin files."""
 
 import hashlib
 import importlib
@@ -20,22 +20,22 @@ HOMES = {
     "head_direction": "neuroslam.cells.head_direction",
     "speed": "neuroslam.cells.speed",
 }
-"""Module of each kind that the package has, in the order in which a brain steps them."""
+"""Module of each of the package's own kinds, in the order in which a brain steps them."""
 
 ENTRY_POINTS = "neuroslam.populations"
-"""Group of the entry points by which an installed package adds populations."""
+"""Entry-point group by which an installed package adds populations."""
 
 PLUGINS = "NEUROSLAM_PLUGINS"
-"""Environment variable with the files of :func:`load_plugin`, for the processes of a sweep."""
+"""Environment variable that passes the files of :func:`load_plugin` to processes of a sweep."""
 
 registered: dict[str, type[Any]] = {}
-"""Class of each kind whose module was imported, as :mod:`neuroslam.state.registry` fills it."""
+"""Class of each kind whose module has been imported; :mod:`neuroslam.state.registry` fills it."""
 
 _loaded: dict[str, bytes] = {}  # files of load_plugin, and what they held
 
 
 def known_kinds() -> tuple[str, ...]:
-    """Return every kind that a brain may be composed of, the package's own first.
+    """Return all kinds of populations, the package's own first.
 
     Example:
         >>> known_kinds()[:3]
@@ -47,7 +47,7 @@ def known_kinds() -> tuple[str, ...]:
 
 
 def population_class(kind: str) -> type[Any]:
-    """Return the class of a kind; its module is imported when it is first asked for.
+    """Return the class of a kind; the first call imports its module.
 
     Raises:
         ConfigError: If no such population is known.
@@ -69,7 +69,7 @@ def population_class(kind: str) -> type[Any]:
 
 
 def section_class(kind: str) -> type[Any] | None:
-    """Return the config section of a population that is not built into :class:`BrainConfig`."""
+    """Return the section class of a population whose section is no field of ``BrainConfig``."""
     return None if kind in ("pose", "place", "semantic") else population_class(kind).config_section
 
 
@@ -161,7 +161,7 @@ def _load_installed(point: EntryPoint) -> None:
 
 
 def _load_plugins_of_parent() -> None:
-    """Load the plugins of the process that started this one."""
+    """Load the plugins of the parent process."""
     for file in filter(None, os.environ.get(PLUGINS, "").split(os.pathsep)):
         if file not in _loaded:
             load_plugin(file)

@@ -166,7 +166,7 @@ def test_what_is_wrong_with_weights_is_said(features, weights, said, squeezenet)
     ("view", "said"),
     [
         ({"features": "resnet18"}, "features resnet18 needs weights"),
-        ({"weights": "a.pth"}, "weights are of a named network, and features is grey"),
+        ({"weights": "a.pth"}, "weights belong to a named network, but features is grey"),
         ({"features": "module", "weights": "a.pth"}, "and features is module"),
     ],
 )
