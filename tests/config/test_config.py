@@ -12,6 +12,9 @@ from neuroslam.cells import NavigationCells
 from neuroslam.config import (
     CLASSIC_NAMES,
     BrainConfig,
+    GridCellConfig,
+    PoseCellConfig,
+    ViewConfig,
     build_config,
     merge_values,
     parse_assignment,
@@ -20,7 +23,6 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
-from neuroslam.config.sections import GridCellConfig, PoseCellConfig, ViewConfig
 from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import ConfigError, RenamedKeyWarning
 from neuroslam.runs.run import resolve_config
@@ -33,7 +35,7 @@ def test_every_preset_is_a_config_and_survives_toml(name):
     assert build_config(tomllib.loads(to_toml(config))) == config
 
 
-def test_the_presets_the_data_need_are_there():
+def test_presets_exist_for_the_published_data():
     wanted = {"openratslam", "irat", "new_college", "lab_tour", "virtual_tour", "rc_car"}
     assert wanted <= set(preset_names())
 
@@ -73,14 +75,14 @@ def test_the_presets_the_data_need_are_there():
         ({"view": {"features": "gray"}}, r"features gray needs weights: .*; did you mean 'grey'\?"),
     ],
 )
-def test_what_cannot_be_used_is_said_in_one_line(values, message):
+def test_an_invalid_config_raises_one_line(values, message):
     with pytest.raises(ConfigError, match=message) as caught:
         build_config(values)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("make", "where", "said"),
+    ("make", "where", "message"),
     [
         (
             lambda: BrainConfig(veiw={}),
@@ -110,14 +112,14 @@ def test_what_cannot_be_used_is_said_in_one_line(values, message):
         (lambda: PoseCellConfig(mood="fine"), ("mood",), "unknown key 'mood'"),
     ],
 )
-def test_a_config_made_in_python_says_what_was_meant(make, where, said):
+def test_a_config_made_in_python_suggests_the_known_name(make, where, message):
     with pytest.raises(ValidationError) as caught:
         make()
     [error] = caught.value.errors()
-    assert (error["loc"], error["msg"]) == (where, said)
+    assert (error["loc"], error["msg"]) == (where, message)
 
 
-def test_what_else_is_wrong_is_told_after_unknown_keys():
+def test_other_errors_are_listed_after_unknown_keys():
     with pytest.raises(ValidationError) as caught:
         BrainConfig(map={"solver": "relx"}, threads=0, view={"threshold": 2, "crp": None})
     errors = caught.value.errors()
@@ -127,12 +129,12 @@ def test_what_else_is_wrong_is_told_after_unknown_keys():
     assert caught.value.title == "BrainConfig"
 
 
-def test_a_config_cannot_be_changed_after_it_was_checked():
+def test_a_config_is_frozen():
     with pytest.raises(ValueError, match="frozen"):
         BrainConfig().view.threshold = 3
 
 
-def test_the_later_wins():
+def test_later_values_replace_earlier_ones():
     over = merge_values(read_preset("rc_car"), parse_assignment("view.threshold=0.01"))
     config = build_config(over)
     assert config.view.threshold == 0.01
@@ -198,7 +200,7 @@ def test_a_world_reads_the_old_name_of_an_option_with_a_warning():
     assert not np.array_equal(old.truths(), still.truths())
 
 
-# --- parameters that must agree -----------------------------------------------------------------
+# --- dependent parameters ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -246,30 +248,32 @@ def test_spacings_follow_the_number_of_orientations(orientations_deg, spacings_m
         ({"spacings_m": [-0.3]}, r"spacings_m has -0\.3; expected more than 0"),
     ],
 )
-def test_grid_modules_that_do_not_agree_are_one_line(values, message):
+def test_spacings_and_orientations_of_different_length_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
         build_config({"grid_cells": values})
 
 
-def test_cells_live_with_one_spacing_given():
+def test_navigation_cells_have_one_module_for_one_spacing():
     cells = NavigationCells(BrainConfig(grid_cells={"spacings_m": (0.25,), "n_cells": 4}))
     assert cells.grid.rates.shape == (1, 4)
 
 
 @pytest.mark.parametrize(("width", "shift"), [(2, 0), (5, 2), (8, 3), (9, 4), (60, 4)])
-def test_the_shift_follows_a_narrow_template(width, shift):
+def test_the_default_shift_fits_a_narrow_template(width, shift):
     assert ViewConfig(template_width=width).shift_match == shift
     with pytest.raises(ValidationError, match="leaves no column"):
         ViewConfig(template_width=width, shift_match=(width + 1) // 2)
 
 
-def test_the_dimension_follows_scales_that_are_given_for_each():
+def test_the_dimension_follows_the_length_of_scale_lists():
     assert SSPSpaceConfig(reach_m=(1.0, 2.0, 3.0)).dimension == 3
     assert SSPSpaceConfig(length_scale_m=(0.2, 0.3, 0.4), reach_m=(1.0, 2.0, 3.0)).dimension == 3
     assert SSPSpaceConfig(reach_m=2.0).dimension == 2
-    with pytest.raises(ValidationError, match="one number or 2 of them"):
+    with pytest.raises(ValidationError, match="expected one positive number or 2 of them"):
         SSPSpaceConfig(dimension=2, reach_m=(1.0, 2.0, 3.0))
-    with pytest.raises(ConfigError, match=r"space.dimension is 3; a brain lives in 2"):
+    with pytest.raises(
+        ConfigError, match=r"space.dimension is 3; expected 2: a brain maps a plane"
+    ):
         build_config({"semantic": {"space": {"reach_m": [1.0, 2.0, 3.0]}}})
 
 
@@ -312,7 +316,7 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
         ("a.toml", b"\xff\xfe\x00", "cannot be read as text"),
     ],
 )
-def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
+def test_the_error_names_a_file_that_cannot_be_read(tmp_path, name, text, message):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigError, match=message) as caught:
@@ -320,7 +324,7 @@ def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
     assert name in str(caught.value)
 
 
-def test_missing_files_and_presets_are_named(tmp_path):
+def test_the_error_names_a_missing_file_or_preset(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         read_config_file(tmp_path / "none.toml")
     with pytest.raises(ConfigError, match=r"no such file; rc_car is a preset, --preset rc_car$"):
@@ -329,13 +333,13 @@ def test_missing_files_and_presets_are_named(tmp_path):
         read_preset("rc_cart")
 
 
-def test_every_classic_name_leads_to_a_field_of_ours():
+def test_every_openratslam_name_maps_to_a_config_field():
     config = BrainConfig()
     for section, name in CLASSIC_NAMES.values():
         assert hasattr(getattr(config, section), name)
 
 
-def test_the_page_of_parameters_is_up_to_date():
+def test_the_parameter_page_is_up_to_date():
     docs = Path(__file__).resolve().parents[2] / "docs"
     spec = importlib.util.spec_from_file_location("parameters", docs / "parameters.py")
     module = importlib.util.module_from_spec(spec)
@@ -354,5 +358,5 @@ def described(section, path=""):
             yield f"{path}{key}"
 
 
-def test_every_parameter_says_what_it_does():
+def test_every_parameter_has_a_description():
     assert "semantic.space.reach_m" in set(described(BrainConfig))
