@@ -523,7 +523,7 @@ def test_a_leader_of_ones_own_makes_the_map_is_saved_and_goes_on(squares, tmp_pa
     assert equal(whole, cut)
     assert type(whole.leader) is Squares
     assert whole.map.n == len(whole.squares.squares) == 6  # of half a metre each
-    assert whole.map.pose == pytest.approx((3.0, 0.0, 0.0), abs=1e-9)
+    assert whole.map.pose == pytest.approx((0.5 * (0.05 + 59 * 0.1), 0.0, 0.0), abs=1e-9)
     assert verify(tmp_path / "whole") == []
 
 
