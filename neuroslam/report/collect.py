@@ -3,6 +3,7 @@
 import base64
 import inspect
 import math
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -257,7 +258,7 @@ def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
         drawn = {} if kind in _DRAWN else pictures_of(population)
         card = {
             "kind": kind.replace("_", " "),
-            "what": (inspect.getdoc(type(population)) or "").partition("\n")[0],
+            "what": _plain((inspect.getdoc(type(population)) or "").partition("\n")[0]),
             "counts": metric_rows(counts_of(population)),
             "pictures": [
                 {"tag": tag, "layers": [_png(layer) for layer in layers]}
@@ -268,6 +269,16 @@ def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
         if card["counts"] or card["pictures"]:
             cards.append(card)
     return cards
+
+
+def _plain(text: str) -> str:
+    """Drop the roles and quotes of a docstring.
+
+    Example:
+        >>> _plain("See :func:`~a.b`, or ``c``.")
+        'See b, or c.'
+    """
+    return re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text).replace("`", "")
 
 
 def _png(picture: np.ndarray) -> dict[str, Any]:

@@ -75,8 +75,8 @@ function startPopulations() {
     for (const { tag, layers } of one.pictures) {
       const drawn = layers.map(({ png, width, height }) => {
         const scale = Math.max(1, Math.min(12, Math.floor(280 / Math.max(width, height))));
-        return make("img", { class: "activity", src: `data:image/png;base64,${png}`, width: width * scale, height: height * Math.max(scale, Math.ceil(24 / height)),
-          alt: `${tag}: activity of ${one.kind}` });
+        return make("img", { class: "activity", src: `data:image/png;base64,${png}`,
+          style: { width: `${width * scale}px`, height: `${height * Math.max(scale, Math.ceil(24 / height))}px` }, alt: `${tag}: activity of ${one.kind}` });
       });
       card.append(make("figure", {}, make("div", { class: "layers-of" }, ...drawn), make("figcaption", { text: tag })));
     }
