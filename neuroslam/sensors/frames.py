@@ -12,6 +12,9 @@ from neuroslam.types import Frame, Velocity
 _KINDS = {"U": "text", "S": "text", "O": "objects", "b": "booleans", "c": "complex numbers"}
 _LARGEST_INDEX = 2**63
 
+_FASTEST = 1e6
+"""In m/s or rad/s: no robot is faster, and far beyond it cells can no longer be counted."""
+
 
 def checked_array(
     value: object, what: str, shape: tuple[int | None, ...], meaning: str
@@ -83,7 +86,7 @@ def checked_number(value: object, what: str, unit: str) -> float:
 
 
 def checked_odometry(velocity: object) -> Velocity:
-    """Return measured self-motion, if it is one: two finite numbers.
+    """Return measured self-motion, if it is one: two finite numbers of at most 1e6.
 
     Raises:
         BadFrame: If it is not.
@@ -107,6 +110,11 @@ def checked_odometry(velocity: object) -> Velocity:
     v, w = _as_float(v), _as_float(w)
     if not (math.isfinite(v) and math.isfinite(w)):
         raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
+    if max(abs(v), abs(w)) > _FASTEST:
+        raise BadFrame(
+            f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected at most {_FASTEST:g}: check the "
+            "units of the source"
+        )
     return Velocity(v, w)
 
 
