@@ -60,10 +60,10 @@ def test_worlds_are_read_from_files(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("{", "not a world"),
+        ("{", "is no world"),
         ('{"landmarks": [{"name": "A"}]}', "position_m"),
         ('{"landmarks": []}', "at least one"),
-        ('{"landmarks": [{"name": "A", "position_m": [3, 0]}]}', "must lie within"),
+        ('{"landmarks": [{"name": "A", "position_m": [3, 0]}]}', "expected corners within"),
     ],
 )
 def test_files_that_are_no_worlds_are_refused(tmp_path, content, said):
@@ -85,7 +85,7 @@ def test_positions_that_cannot_be_are_refused(position, said):
 
 
 def test_unknown_and_double_landmarks_are_refused():
-    with pytest.raises(SourceError, match="no landmark 'X'; there is L0"):
+    with pytest.raises(SourceError, match="no landmark 'X'; expected one of L0"):
         random_world().named("X")
     with pytest.raises(SourceError, match="twice"):
         make_world([point("A", (0, 0)), point("A", (0, 1))])
@@ -137,8 +137,8 @@ def test_two_rooms_and_kitti_and_a_rat_are_paths(shared):
     ("rows", "said"),
     [
         ([[0, 0]] * 3, "at least 4"),
-        ([[np.nan, 0]] * 9, "must be numbers"),
-        ([[1, 2]] * 9, "one place"),
+        ([[np.nan, 0]] * 9, "a position is not finite"),
+        ([[1, 2]] * 9, "all positions are equal"),
     ],
 )
 def test_files_that_are_no_paths_are_refused(tmp_path, rows, said):

@@ -324,9 +324,9 @@ def test_every_world_says_what_it_is():
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("world:coridor", "world 'coridor': there is none; there are corridor, ellipse, .*"
+        ("world:coridor", "world 'coridor': no such world; expected one of corridor, ellipse, .*"
          "; did you mean 'corridor'?"),
-        ("world:", "world '': there is none; there are corridor, .*"),
+        ("world:", "world '': no such world; expected one of corridor, .*"),
         ("world:town?lapps=2", "world 'town': unknown option 'lapps'; there are laps, start, .*"
          "; did you mean 'laps'?"),
         ("world:town?laps", "world 'town': option 'laps' has no value; write laps=VALUE once"),
