@@ -343,7 +343,7 @@ def test_a_camera_gives_images_at_the_times_they_come(monkeypatch):
     assert absolute_spec("camera:0") == "camera:0"
 
 
-def test_what_a_camera_showed_is_not_looked_for_later(monkeypatch, tmp_path):
+def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_path):
     monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
     small = ["--set", "view.template_width=16", "--set", "odometry.max_shift_px=8"]
     out = tmp_path / "out"

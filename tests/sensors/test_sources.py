@@ -183,7 +183,7 @@ def test_a_damaged_png_is_refused_without_a_word_of_the_decoder(tmp_path, capfd)
     assert capfd.readouterr().err == ""
 
 
-def test_a_change_of_size_is_told_with_both_sizes_wherever_one_starts(tmp_path):
+def test_a_change_of_size_is_reported_with_both_sizes_wherever_one_starts(tmp_path):
     folder = fill(tmp_path / "f", 4)
     (folder / "2.png").write_bytes(encoded(2, width=40, height=30))
     said = refused(folder)
@@ -476,7 +476,7 @@ def test_what_numpy_did_not_write_is_not_called_a_pickle(name, tmp_path):
     assert refused(path) == (f"{path}: is not an .npz or .npy file; expected one written by numpy")
 
 
-def test_an_address_is_told_as_typed_and_stays_what_it_is():
+def test_an_address_is_reported_as_typed_and_stays_unchanged():
     address = "http://example.com/x.mp4"
     assert refused(address).startswith(
         f"{address}: is an address; open it as a camera: camera:http"

@@ -77,7 +77,7 @@ def test_brightness_of_features_does_not_matter_and_silence_is_grey():
 
 
 @pytest.mark.parametrize("grey", [False, True])
-def test_a_place_is_learnt_once_and_recognised_after(grey):
+def test_a_view_is_learnt_once_and_matched_afterwards(grey):
     cells = LocalViewCells(ViewConfig(**SMALL), filters())
     images = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
     first, again = [[cells(p) for p in images] for _ in range(2)]
@@ -154,7 +154,7 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
         ("resnet18", "squeezenet.pth", "not of resnet18"),
     ],
 )
-def test_what_is_wrong_with_weights_is_said(features, weights, said, squeezenet):
+def test_errors_of_weights_are_reported(features, weights, said, squeezenet):
     (squeezenet / "text.pth").write_text("no weights")
     torch.save([torch.zeros(2)], squeezenet / "list.pth")
     with pytest.raises(ConfigError, match=said) as error:
@@ -194,7 +194,7 @@ class Gives(nn.Module):
         (nn.Conv2d(3, 4, 200), ConfigError, "fails on an image of 96x64 px"),
     ],
 )
-def test_what_is_wrong_with_a_network_is_said(found, error, said):
+def test_errors_of_a_network_are_reported(found, error, said):
     with pytest.raises(error, match=said):
         LocalViewCells(ViewConfig(**SMALL), Gives(found))(texture())
 
@@ -279,7 +279,7 @@ def test_after_a_gap_the_network_makes_the_views_of_a_new_map(tour):
     assert brain.view.network_digest == brain.stored[0].view.network_digest != 0
 
 
-def test_networks_without_weights_are_told_apart_by_their_parts():
+def test_networks_without_weights_are_distinguished_by_their_parts():
     pooled = [FeatureEncoder(ViewConfig(**SMALL), nn.AvgPool2d(size)).digest for size in (4, 8, 4)]
     assert pooled[0] == pooled[2] != pooled[1]
 
@@ -316,7 +316,7 @@ def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(
         load_network("swin_t.features", path)
 
 
-def test_a_network_that_reckons_with_tensors_can_be_made(tmp_path):
+def test_a_network_that_computes_its_widths_with_tensors_can_be_made(tmp_path):
     path = weights_of("regnet_y_400mf", tmp_path)
     assert load_network("regnet_y_400mf.trunk_output", path)(torch.rand(1, 3, 64, 64)).ndim == 4
 

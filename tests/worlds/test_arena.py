@@ -182,7 +182,7 @@ def test_no_wall_is_seen_through_the_wall_between_two_rooms():
     assert through_the_door[0, 1] == pytest.approx(1.2)
 
 
-def test_who_stands_at_a_wall_sees_it_and_not_through_it():
+def test_a_position_at_a_wall_sees_it_but_not_through_it():
     square = named_arena("square")
     at_wall = [(1.0 + 1e-12, 0.25), (1.0 - 1e-12, 0.25), (1.0, 0.25)]
     assert square.contains(at_wall).all()
@@ -320,7 +320,7 @@ BOX = [(0, 0), (2, 0), (2, 2), (0, 2)]
         (lambda: named_arena("maze"), "no arena is named 'maze'; expected one of"),
     ],
 )
-def test_what_is_no_arena_is_refused_in_one_line(make, says):
+def test_an_invalid_arena_is_a_one_line_error(make, says):
     with pytest.raises(SourceError) as error:
         make()
     assert says in str(error.value)

@@ -451,7 +451,8 @@ def test_ranges_lead_to_the_walls_and_come_in_place_of_them():
     off = np.array([noisy.frame(i).ranges - exact.frame(i).ranges for i in range(200)])
     assert off.std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_array_equal(noisy.frame(7).ranges, noisy.frame(7).ranges)
-    assert "has no arena, so no ranges" in refused(lambda: ArenaSource(wander(arena=None), beams=60))
+    said = refused(lambda: ArenaSource(wander(arena=None), beams=60))
+    assert "has no arena, so no ranges" in said
 
 
 def test_a_track_with_an_arena_opens_with_its_walls(shared, tmp_path):
@@ -464,7 +465,7 @@ def test_a_track_with_an_arena_opens_with_its_walls(shared, tmp_path):
     assert not isinstance(open_source(tmp_path / "w.npz"), ArenaSource)
 
 
-def test_rows_that_a_track_with_an_arena_lost_are_a_fault_that_may_be_left_out(tmp_path):
+def test_dropped_rows_of_a_track_with_an_arena_are_one_bad_frame(tmp_path):
     path = tmp_path / "w.npz"
     np.savez(path, t=np.arange(4.0), pos=[[0, 0], [1, 0], [np.nan, 0], [3, 0]], arena_radius=5.0)
     assert "1 row has no numbers" in refused(lambda: list(open_source(path)))
