@@ -231,9 +231,9 @@ def test_a_video_of_unknown_length_is_refused_after_reading(tmp_path):
     film(tmp_path / "a.mkv", 9, 10.0, "mp4v")
     log(tmp_path / "m.csv", np.arange(5.0, 9.0))
     source = open_source(f"{tmp_path}/a.mkv+{tmp_path}/m.csv")
-    said = refused(lambda: list(source))
-    assert "a.mkv runs from 0 s to 0.8 s" in said
-    assert "m.csv runs from 5 s to 8 s" in said
+    message = refused(lambda: list(source))
+    assert "a.mkv runs from 0 s to 0.8 s" in message
+    assert "m.csv runs from 5 s to 8 s" in message
 
 
 def test_images_before_and_after_the_motion_are_counted():
@@ -287,8 +287,8 @@ def test_a_file_with_a_plus_in_its_name_is_that_file(tmp_path, monkeypatch):
     merged = open_source("a+b.csv+c+d.avi")
     assert isinstance(merged, Streams)
     assert [f.time_s for f in merged] == [0.0, 1.0]
-    said = refused(lambda: open_source("a+b.csv+none.avi"))
-    assert "a+b.csv+none.avi: a+b.csv exists, 'none.avi' does not" in said
+    message = refused(lambda: open_source("a+b.csv+none.avi"))
+    assert "a+b.csv+none.avi: a+b.csv exists, 'none.avi' does not" in message
 
 
 def test_a_camera_may_be_merged_with_a_walk_and_its_walls(tmp_path):

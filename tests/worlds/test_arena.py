@@ -288,7 +288,7 @@ BOX = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda: Arena([(0, 0), (1, 0)]), "arena: the boundary has shape (2, 2); expected"),
         (lambda: Arena([(0, 0), (1, 0), (1, 0)]), "side 1 has length 0"),
@@ -320,8 +320,8 @@ BOX = [(0, 0), (2, 0), (2, 2), (0, 2)]
         (lambda: named_arena("maze"), "no arena is named 'maze'; expected one of"),
     ],
 )
-def test_an_invalid_arena_is_a_one_line_error(make, says):
+def test_an_invalid_arena_is_a_one_line_error(make, message):
     with pytest.raises(SourceError) as error:
         make()
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)

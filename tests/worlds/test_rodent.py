@@ -93,7 +93,7 @@ def test_rows_without_numbers_or_with_a_time_that_does_not_rise_are_dropped_and_
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "is empty; expected time_s,x_m,y_m: seconds and metres"),
         ("time_s,x_m,y_m\n", "has a header, but no lines"),
@@ -103,10 +103,10 @@ def test_rows_without_numbers_or_with_a_time_that_does_not_rise_are_dropped_and_
         ("time_s,x_m,y_m\n1,1,1\n0,1,1\n2,,\n", "1 of 3 rows"),
     ],
 )
-def test_a_walk_that_cannot_be_used_says_why(tmp_path, text, says):
+def test_a_walk_that_cannot_be_used_says_why(tmp_path, text, message):
     path = tmp_path / "w.csv"
     path.write_text(text)
-    assert says in refused(lambda: read_walk(path))
+    assert message in refused(lambda: read_walk(path))
     assert "w.csv" in refused(lambda: read_walk(path))
 
 
@@ -451,8 +451,8 @@ def test_ranges_lead_to_the_walls_and_come_in_place_of_them():
     off = np.array([noisy.frame(i).ranges - exact.frame(i).ranges for i in range(200)])
     assert off.std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_array_equal(noisy.frame(7).ranges, noisy.frame(7).ranges)
-    said = refused(lambda: ArenaSource(wander(arena=None), beams=60))
-    assert "has no arena, so no ranges" in said
+    message = refused(lambda: ArenaSource(wander(arena=None), beams=60))
+    assert "has no arena, so no ranges" in message
 
 
 def test_a_track_with_an_arena_opens_with_its_walls(shared, tmp_path):
@@ -494,7 +494,7 @@ def test_a_recorded_walk_is_opened_with_noise_length_and_rate(shared):
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         ("arena:nowhere", "'nowhere'"),
         ("arena:square?minute=3", "arena 'square': unknown option 'minute'"),
@@ -504,13 +504,13 @@ def test_a_recorded_walk_is_opened_with_noise_length_and_rate(shared):
         ("arena:nowhere.npz", "nowhere.npz: no such file"),
     ],
 )
-def test_an_arena_that_cannot_be_opened_says_why(spec, says):
-    assert says in refused(lambda: open_source(spec))
+def test_an_arena_that_cannot_be_opened_says_why(spec, message):
+    assert message in refused(lambda: open_source(spec))
 
 
 def test_an_unknown_arena_is_refused_with_the_choices():
-    said = refused(lambda: open_source("arena:nowhere"))
-    assert all(name in said for name in ARENAS)
+    message = refused(lambda: open_source("arena:nowhere"))
+    assert all(name in message for name in ARENAS)
 
 
 def test_a_recording_without_an_arena_is_not_opened_as_one(tmp_path):
