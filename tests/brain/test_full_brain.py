@@ -87,7 +87,7 @@ def test_landmarks_bring_a_lap_home(cells, drive):
     track = np.array([brain(frame).pose[:2] for frame in drive])
     assert absolute_trajectory_error(track, truth, "rigid").rmse < 0.35
     assert brain.semantic.n == 12
-    places = open_source(DRIVE).places_m
+    places = open_source(DRIVE).posts_m
     known = brain.semantic.landmarks()
     laid = align(track, truth, "rigid").apply(known["place_m"])
     off = np.linalg.norm(laid - places[known["number"]], axis=1)
