@@ -21,8 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 WORLD = "world:corridor?frames_per_lap=110&laps=1.4&width=160&height=120&grey=true"
 SESSIONS = ("drive", "monday", "tuesday", "wednesday", "friday")
-SHORT = {"world:": "40", "arena:": "4000"}
+SHORT = {"world:": "40", "arena:": "200"}
 """Rendered worlds and arenas run for so many frames only, for the sake of time."""
+MERGED = "2000"
+"""Frames of an arena whose map is merged: until enough of its walls are known."""
 
 
 def commands(page: Path) -> list[str]:
@@ -128,6 +130,7 @@ def write_bag(path, frames):
                 writer.write(connections[topic], seconds * 10**9 + nanoseconds, data)
 
 
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda p: p.name)
 def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -136,18 +139,21 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
     if "drive.bag" in page.read_text():
         pytest.importorskip("rosbags", reason="needs the extra rosbag")
         write_bag(tmp_path / "drive.bag", list(open_source(WORLD).frames(0, 60)))
+    merged = {map_ for line in commands(page) for map_ in line.split()[2:4] if " merge " in line}
     for line in commands(page):
         words = shlex.split(line, comments=True)[1:]
         if words[0] == "experiment":  # minutes or hours; each has small tests of its own
             assert words[1] in EXPERIMENTS
             continue
         if frames := SHORT.get(words[1][:6]):
-            words += ["--stop", frames]
+            is_merged = words[1].startswith("arena:") and words[words.index("-o") + 1] in merged
+            words += ["--stop", MERGED if is_merged else frames]
         code = cli.main(words)
         told = capsys.readouterr()
         assert code == 0, f"{line}\n{told.err}{told.out}"
 
 
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("name", ["own_population.md", "sweeps.md", "tuning.md", "features.md"])
 def test_the_programs_of_a_page_run_as_printed(name, inputs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -43,7 +43,7 @@ def tune_command(
         say(note)
     for name, trial in (("before", tuning.before), ("found", tuning.after)):
         say(
-            f"{name}: {trial.n_places} places, {trial.n_links} links, "
+            f"{name}: {trial.n_experiences} experiences, {trial.n_links} links, "
             f"inconsistency {shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
         )
     say(tuning.verdict)

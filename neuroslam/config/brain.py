@@ -69,9 +69,11 @@ class BrainConfig(Section):
         """Check the section of each population with the population's own section class."""
         if not isinstance(values, dict):
             return values
-        checked, refused = dict(values), []
+        checked, refused, named = dict(values), [], _kinds(values.get("cells", ()))
         for key in [key for key in values if key not in cls.model_fields]:
             section = section_class(key) if key in known_kinds() else None
+            if section is None and key in named and key not in known_kinds():
+                continue  # cells says it better: there is no such population
             if section is None:
                 refused.append(
                     InitErrorDetails(type="extra_forbidden", loc=(key,), input=values[key])
@@ -83,7 +85,7 @@ class BrainConfig(Section):
                     raise _inside(key, error) from None
         if refused:
             raise ValidationError.from_exception_data(cls.__name__, refused)
-        for kind in _kinds(values.get("cells", ())):
+        for kind in named:
             if kind not in checked and kind in known_kinds() and (section := section_class(kind)):
                 checked[kind] = section()
         return checked
@@ -105,6 +107,10 @@ class BrainConfig(Section):
                 f"expected one or several of {', '.join(known)}, each once, joined by +"
             )
         return tuple(kind for kind in known if kind in value)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Go to another process as plain values: sections may be of a plugin not yet loaded."""
+        return BrainConfig.model_validate, (self.model_dump(),)
 
     def section(self, kind: str) -> Section:
         """Return the section of a population that has its own section.

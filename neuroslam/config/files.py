@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from neuroslam.config.brain import BrainConfig
 from neuroslam.config.classic import from_classic
-from neuroslam.errors import ConfigError, did_you_mean
+from neuroslam.errors import ConfigError, did_you_mean, with_new_names
 
 
 def preset_folder() -> Path:
@@ -54,7 +54,7 @@ def read_config_file(path: Path) -> dict[str, Any]:
     if path.suffix.lower() in (".ini", ".txt"):
         return from_classic(text, path)
     try:
-        return tomllib.loads(text)
+        return _with_new_keys(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"config {path}: not valid TOML: {error}") from None
 
@@ -93,7 +93,18 @@ def parse_assignment(text: str) -> dict[str, Any]:
         value = raw.strip()
     for part in reversed(key.strip().split(".")):
         value = {part: value}
-    return value
+    return _with_new_keys(value)
+
+
+def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:
+    """Call renamed keys by their present names, before other values are laid over them."""
+    known = dict(values)
+    for name, section in values.items():
+        field = BrainConfig.model_fields.get(name)
+        renamed = getattr(field.annotation, "renamed", None) if field else None
+        if renamed and isinstance(section, dict):
+            known[name] = with_new_names(section, renamed, name)
+    return known
 
 
 def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:

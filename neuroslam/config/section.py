@@ -64,6 +64,12 @@ def _with_hint(section: type[BaseModel], error: ErrorDetails) -> InitErrorDetail
         own = str(error["loc"][0]) in section.model_fields or len(error["loc"]) == 1
         # The section of a population has made its own suggestion.
         hint = _suggest_key(section, key) if own else separator + suggestion
+        if (
+            not hint
+            and isinstance(error["input"], Mapping)
+            and section.model_config.get("extra") == "allow"
+        ):
+            hint = "; if it is a section of your own population, give its file with --plugin FILE"
         kind, message = "unknown_key", f"unknown key {key!r}{hint}"
     elif kind == "literal_error" and "did you mean" not in message:
         message += _suggest_choice(error)

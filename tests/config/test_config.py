@@ -4,6 +4,7 @@ import importlib.util
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
@@ -23,8 +24,9 @@ from neuroslam.config import (
     to_toml,
 )
 from neuroslam.config.semantic import SSPSpaceConfig
-from neuroslam.errors import ConfigError
+from neuroslam.errors import ConfigError, RenamedKeyWarning
 from neuroslam.runs.run import resolve_config
+from neuroslam.sensors import open_source
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -146,6 +148,56 @@ def test_assignments_read_toml_values():
     assert parse_assignment("map.solver=least_squares") == {"map": {"solver": "least_squares"}}
     with pytest.raises(ConfigError, match=r"expected section\.key=value"):
         parse_assignment("nonsense")
+
+
+# --- names of the last release ------------------------------------------------------------------
+
+OLD_NAME = r"^sessions: carried is called kidnapped now; the old name is read until the next"
+
+
+def test_an_old_name_is_read_with_a_warning():
+    with pytest.warns(RenamedKeyWarning) as told:
+        config = build_config({"sessions": {"carried": "ignore", "carried_factor": 3.5}})
+    assert (config.sessions.kidnapped, config.sessions.kidnapped_factor) == ("ignore", 3.5)
+    assert len(told) == 2
+
+
+def test_a_file_and_an_assignment_with_an_old_name_are_read_with_a_warning(tmp_path):
+    (tmp_path / "old.toml").write_text('[sessions]\ncarried = "ignore"\n')
+    with pytest.warns(RenamedKeyWarning, match=OLD_NAME):
+        values = read_config_file(tmp_path / "old.toml")
+    assert values == {"sessions": {"kidnapped": "ignore"}}
+    with pytest.warns(RenamedKeyWarning, match=OLD_NAME):
+        assert parse_assignment("sessions.carried=detect") == {"sessions": {"kidnapped": "detect"}}
+
+
+def test_the_later_wins_whatever_name_it_has(tmp_path):
+    (tmp_path / "old.toml").write_text('[sessions]\ncarried = "detect"\n')
+    assert resolve_config("openratslam").sessions.kidnapped == "ignore"
+    with pytest.warns(RenamedKeyWarning):
+        over_preset = resolve_config("openratslam", None, ("sessions.carried=detect",))
+    with pytest.warns(RenamedKeyWarning):
+        over_file = resolve_config(None, tmp_path / "old.toml", ("sessions.kidnapped=ignore",))
+    base = BrainConfig(sessions={"kidnapped": "detect"})
+    with pytest.warns(RenamedKeyWarning):
+        over_base = resolve_config(None, None, ("sessions.carried=ignore",), base)
+    assert [c.sessions.kidnapped for c in (over_preset, over_file, over_base)] == [
+        "detect", "ignore", "ignore",
+    ]  # fmt: skip
+
+
+def test_two_names_of_one_key_are_refused():
+    with pytest.raises(ConfigError, match=r"unknown key 'sessions\.carried'"):
+        build_config({"sessions": {"carried": "ignore", "kidnapped": "detect"}})
+
+
+def test_a_world_reads_the_old_name_of_an_option_with_a_warning():
+    with pytest.warns(RenamedKeyWarning, match="carried is called kidnapped now"):
+        old = open_source("world:corridor?laps=1&frames_per_lap=60&carried=2:0.5")
+    new = open_source("world:corridor?laps=1&frames_per_lap=60&kidnapped=2:0.5")
+    np.testing.assert_array_equal(old.truths(), new.truths())
+    still = open_source("world:corridor?laps=1&frames_per_lap=60")
+    assert not np.array_equal(old.truths(), still.truths())
 
 
 # --- dependent parameters ------------------------------------------------------------------------

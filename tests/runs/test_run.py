@@ -219,7 +219,7 @@ def test_ctrl_c_saves_and_the_run_goes_on_as_if_it_had_not_been(tmp_path):
                 process.send_signal(signal.SIGINT)
                 break
             time.sleep(0.01)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
     assert said.decode() == (f"neuroslam run: interrupted; go on with: neuroslam resume {out}\n")
     metrics = json.loads((out / "metrics.json").read_text())
