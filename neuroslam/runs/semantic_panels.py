@@ -131,7 +131,7 @@ class Known(NamedTuple):
 def known_landmarks(cells: SemanticCells) -> Known:
     """Return the landmarks that cells have seen most often, where they recall them to be."""
     table = cells.landmarks()
-    rows = np.flatnonzero(cells.confirmed().numpy(force=True))
+    rows = np.flatnonzero(cells.known.confirmed().numpy(force=True))
     order = np.sort(np.argsort(-table["seen"], kind="stable")[:_ASKED])
     names, places = [str(name) for name in table["name"][order]], table["place_m"][order]
     around = np.vstack([places, [cells.pose[:2]]])
