@@ -18,7 +18,7 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
-from neuroslam.runs.reading import odometry_track, experiences_of, trajectory, true_poses
+from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
 
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000
