@@ -18,7 +18,12 @@ function tableOf(names, rows) {
     make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
 }
 
-const BEGAN = { start: "the run", carried: "the robot was carried", gap: "a gap in the frames" };
+const BEGAN = {
+  start: "the run",
+  kidnapped: "the robot was kidnapped",
+  carried: "the robot was kidnapped", // brains of format 3
+  gap: "a gap in the frames",
+};
 
 function startSessions() {
   const list = $("session-list"), places = new Array(about.sessions.length).fill(0);
