@@ -21,7 +21,7 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
-from neuroslam.runs.reading import odometry_track, places_of, trajectory, true_poses
+from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
 from neuroslam.state.answers import counts_of, pictures_of
 from neuroslam.state.registry import population_classes
 
@@ -128,7 +128,7 @@ def _stride(n: int) -> int:
 def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Everything that has a row a frame; places and poses are those of the final map."""
     frames, trace, brain = run.frames, run.trace, run.brain
-    place = places_of(brain, trace)[0]
+    place = experiences_of(brain, trace)[0]
     track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
     truth = truth_on_map(track, true_poses(trace))[0]
     whole = {

@@ -18,9 +18,12 @@ function tableOf(names, rows) {
     make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
 }
 
-const CARRIED = "the robot was carried";
-// Files written before the word was kidnapped say carried.
-const BEGAN = { start: "the run", kidnapped: CARRIED, carried: CARRIED, gap: "a gap in the frames" };
+const BEGAN = {
+  start: "the run",
+  kidnapped: "the robot was kidnapped",
+  carried: "the robot was kidnapped", // brains of format 3
+  gap: "a gap in the frames",
+};
 
 function startSessions() {
   const list = $("session-list"), places = new Array(about.sessions.length).fill(0);

@@ -342,7 +342,7 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
     assert not nowhere[40:].any()
     assert (page.arrays["row_place"] == -1).tolist() == nowhere.tolist()
     (left,) = page.about["not_joined"]
-    assert "looked like one of it" in left["reason"]
+    assert "matched by view" in left["reason"]
     began = [session["began"] for session in page.about["sessions"]]
     assert "kidnapped" in began
     written = (Path(collect.__file__).parent / "tables.js").read_text()
