@@ -104,7 +104,7 @@ class SpaceError(NeuroslamError, ValueError):
 _SHOWN = 5
 
 
-def listed(values: Iterable[float]) -> str:
+def listed(values: Iterable[object]) -> str:
     """Write the first five of many values, and how many more there are.
 
     Example:

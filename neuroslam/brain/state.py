@@ -23,7 +23,7 @@ from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.state.match import Match
-from neuroslam.state.mergeable import AboutNow, Mergeable, State
+from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
 from neuroslam.state.population import Population
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
@@ -70,6 +70,7 @@ class BrainState(nn.Module):
     sessions: SessionLog
     recognition: Recognition
     continuity: Continuity
+    stored: "ModulesOf[Self]"
 
     def __init__(
         self, config: BrainConfig | None = None, *, features: nn.Module | Encoder | None = None
@@ -77,11 +78,15 @@ class BrainState(nn.Module):
         super().__init__()
         self.config = config or BrainConfig()
         self._encoder = view_encoder(self.config.view, features)
-        self.about = ("", "", "")  # source, preset and date of the next session
+        self.about: tuple[str, str, str] = (
+            "",
+            "",
+            "",
+        )  # source, preset and date of the next session
         self._detects = self.config.sessions.kidnapped == "detect"
         self._after_gap_s = -math.inf  # time of a frame that was refused for a gap before it
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
-        self.stored = nn.ModuleList()
+        self.stored = ModulesOf()
         self._begin()
         self.register_load_state_dict_pre_hook(_make_stored)
         self.register_load_state_dict_post_hook(lambda module, _: module._changed())
@@ -236,7 +241,7 @@ class BrainState(nn.Module):
     def restore(self, state: State, stored: Sequence[Self]) -> None:
         """Go on with another state, and with these stored maps."""
         self._begin()
-        self.stored = nn.ModuleList(stored)
+        self.stored = ModulesOf(stored)
         own = {name: value for name, value in state.items() if not name.startswith("stored.")}
         for i, one in enumerate(stored):
             own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
@@ -290,7 +295,7 @@ class BrainState(nn.Module):
         """Join stored map ``where``, and then those that share a session with it."""
         rest = [one for i, one in enumerate(self.stored) if i != where]
         loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
-        self.stored = nn.ModuleList()  # what else is stored is neither copied nor looked at
+        self.stored = ModulesOf()  # what else is stored is neither copied nor looked at
         merged, report = loaded.merge(self, match)
         self.stored = everything
         report.at_frame = frame.index
@@ -302,7 +307,7 @@ class BrainState(nn.Module):
         for name, part in merged.parts().items():
             setattr(self, name, part)
         self.view.encoder = self._encoder
-        self.stored = nn.ModuleList(rest)
+        self.stored = ModulesOf(rest)
         rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
         for i, (alike, agreed) in enumerate(rows):
             if i != where:
@@ -363,4 +368,4 @@ def _make_stored(module: BrainState, state: State, prefix: str, *_unused: object
     inside = f"{prefix}stored."
     numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
     if len(numbers) != len(module.stored):
-        module.stored = nn.ModuleList(type(module)(module.config) for _ in numbers)
+        module.stored = ModulesOf(type(module)(module.config) for _ in numbers)

@@ -42,6 +42,8 @@ def tune_command(
     for note in tuning.notes:
         say(note)
     for name, trial in (("before", tuning.before), ("found", tuning.after)):
+        if trial is None:
+            continue
         say(
             f"{name}: {trial.n_places} places, {trial.n_links} links, "
             f"inconsistency {shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"

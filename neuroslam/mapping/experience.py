@@ -475,8 +475,7 @@ class ExperienceMap(Mergeable):
         columns = (np.concatenate([own[name][apart], other[name]]) for name in Origins._fields)
         return Origins(*columns)
 
-    @staticmethod
-    def merged(loaded: State, partial: State, join: Join) -> State:
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Place the partial experiences in the loaded map and reroute their links."""
         return merge_maps(loaded, partial, join)
 

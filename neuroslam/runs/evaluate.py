@@ -48,7 +48,7 @@ def evaluate(
     else:
         trace = None if out is None else read_trace(out, len(found.times_s))
         true_track = None if trace is None else true_poses(trace)
-        if true_track is None:
+        if trace is None or true_track is None:
             raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
         i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
         estimate, reference = found.poses[i], true_track[j]

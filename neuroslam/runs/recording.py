@@ -124,8 +124,8 @@ class TensorBoardRecorder(Recorder):
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for population in brain.populations.values():
-                for tag, picture in population.images().items():
-                    self._write_picture(tag, coloured(picture), result.frame)
+                for tag, activity in population.images().items():
+                    self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
 

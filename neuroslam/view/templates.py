@@ -244,8 +244,7 @@ class LocalViewCells(Mergeable):
             self.network.digest = self.encoder.digest
         return self.templates.append(**row)
 
-    @staticmethod
-    def merged(loaded: State, partial: State, join: Join) -> State:
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Keep the loaded templates, then the partial ones that were not matched (Eq. 9)."""
         kept = torch.from_numpy(join.kept_views)
         merged = {
