@@ -3,7 +3,7 @@
 import difflib
 import warnings
 from collections.abc import Iterable, Mapping
-from typing import Any, SupportsFloat
+from typing import Any
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -110,7 +110,7 @@ class SpaceError(NeuroslamError, ValueError):
 _SHOWN = 5
 
 
-def listed(values: Iterable[SupportsFloat]) -> str:
+def listed(values: Iterable[object]) -> str:
     """Write the first five values, and how many more there are.
 
     Example:

@@ -97,10 +97,13 @@ class NavigationBrain(BrainState):
         accepted = self._accept(frame)
         now = self._enter(accepted)
         observed, leader = accepted.observed, self.leader
-        made = [(p, p.step(now, observed[p.kind])) for p in self._with["step"]]
+        made: list[tuple[Population | None, Correction | None]] = [
+            (p, p.step(now, observed[p.kind])) for p in self._with["step"]
+        ]
         if self._compass_turns_map:
             made.append((None, self.compass.step(now.compass_rad, now.motion)))
-        decision = cells = None
+        decision: Decision | None = None
+        cells: Any = None  # until the leader has decided
         if leader.relaxes_map:
             if any(p.vetoes(now.view) for p in self._with["vetoes"]):
                 now = now._replace(vetoed=True)
@@ -186,8 +189,8 @@ class NavigationBrain(BrainState):
         self._after_gap_s = -math.inf
         self.sessions.now.frames += 1
         lost = any(population.lost for population in self._populations.values())
-        arrived = accepted.view is not None and action in ("create", "link")
-        if arrived and self._recognise(frame, accepted.view, view):
+        encoded, arrived = accepted.view, action in ("create", "link")
+        if arrived and encoded is not None and self._recognise(frame, encoded, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.leader.estimate, "set", self.map.current
         return StepResult(
@@ -207,7 +210,7 @@ class NavigationBrain(BrainState):
 
     def _name_session(self, frame: Frame, observed: dict[str, Any]) -> None:
         """Open a session; its id is a hash of config, source and first frame."""
-        found = []
+        found: list[Any] = []
         for observation in observed.values():
             found += observation if isinstance(observation, tuple) else [observation]
         self._open(

@@ -32,7 +32,8 @@ def elsewhere(of: ExperienceMap, experience: int, limits: Tolerance) -> np.ndarr
     """Return which experiences are too far from one for their views to be similar by proximity."""
     poses = of.poses
     apart = np.linalg.norm((poses - poses[experience])[:, :2], axis=1)
-    return apart > limits.near_m / (2.0 * WINDOW)
+    far: np.ndarray = apart > limits.near_m / (2.0 * WINDOW)
+    return far
 
 
 def far_off(

@@ -25,16 +25,20 @@ class Mapped(Protocol):
     @property
     def leader(self) -> Population:
         """The population that decides about experiences."""
+        ...
 
     @property
     def populations(self) -> dict[str, Population]:
         """All populations by kind."""
+        ...
 
     def parts(self) -> dict[str, Mergeable]:
         """The parts of the state by name."""
+        ...
 
     def state_dict(self) -> dict[str, Tensor]:
         """The whole state."""
+        ...
 
 
 def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:

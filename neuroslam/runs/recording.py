@@ -126,8 +126,8 @@ class TensorBoardRecorder(Recorder):
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for population in brain.populations.values():
-                for tag, picture in pictures_of(population).items():
-                    self._write_picture(tag, coloured(picture), result.frame)
+                for tag, activity in pictures_of(population).items():
+                    self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
 

@@ -139,7 +139,7 @@ def plan_sweep(
 def _trial(
     number: int,
     total: int,
-    combination: tuple,
+    combination: tuple[Any, ...],
     keys: tuple[str, ...],
     many_sources: bool,
     preset: str | None,
@@ -251,11 +251,11 @@ def sweep(
                 if on_done is not None:
                     on_done(len(found), len(trials))
     finally:
+        rows = [
+            {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
+            for k, trial in enumerate(trials)
+        ]
         if found:
-            rows = [
-                {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
-                for k, trial in enumerate(trials)
-            ]
             _write(out, rows, [key for key in varied(rows) if key not in ("run", "seed")])
     return rows
 
@@ -280,7 +280,7 @@ def claim(out: Path, summary: str, overwrite: bool) -> None:
 
 def _map(order: _Order) -> dict[str, Any]:
     trial = order.trial
-    arguments = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    arguments: dict[str, Any] = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
     arguments |= {"start": order.start, "stop": order.stop}
     return run_one(trial.source, order.out / trial.name, trial.config, **arguments)
 

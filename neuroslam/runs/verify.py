@@ -119,8 +119,10 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         if tensor.is_floating_point():
             wrong = tensor.isnan() if name in _MAY_BE_INFINITE else ~tensor.isfinite()
             if wrong.any():
-                rows = np.unique(wrong.numpy().nonzero()[0]) if tensor.dim() else []
-                yield f"{name}: not finite" + (f" in rows {listed(rows)}" if tensor.dim() else "")
+                where = ""
+                if tensor.dim():
+                    where = f" in rows {listed(np.unique(wrong.numpy().nonzero()[0]))}"
+                yield f"{name}: not finite{where}"
     n_views, n = len(s["view.templates.pixels"]), len(s["map.experiences.template"])
     for name, limit, what in (
         ("map.experiences.template", n_views, "templates"),

@@ -50,7 +50,7 @@ def tensors_digest(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         tensor = tensors[name].contiguous().cpu()
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
-        digest.update(tensor.reshape(-1).view(uint8).numpy() if tensor.numel() else b"")
+        digest.update(tensor.reshape(-1).view(uint8).numpy().data if tensor.numel() else b"")
     return digest.hexdigest()
 
 

@@ -1,9 +1,9 @@
 """Modules whose state is saved and merged, and rules by which two states become one."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import ClassVar, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from neuroslam.state.join import Join
 
 P = ParamSpec("P")
 T = TypeVar("T")
+M = TypeVar("M", bound=nn.Module)
 
 State = dict[str, Tensor]
 """A ``state_dict``, or the part of one that belongs to a module, without its prefix."""
@@ -35,7 +36,7 @@ class BufferModule(nn.Module):
         super().__init__()
         self.register_load_state_dict_pre_hook(_make_room)
 
-    def __setattr__(self, name: str, value: object) -> None:
+    def __setattr__(self, name: str, value: Any) -> None:  # noqa: ANN401
         """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
 
         Anything else is left to torch.
@@ -45,6 +46,22 @@ class BufferModule(nn.Module):
             buffers[name] = value
         else:
             super().__setattr__(name, value)
+
+
+class ModulesOf(nn.ModuleList, Generic[M]):
+    """A list of modules of one class, for readers and type checkers."""
+
+    if TYPE_CHECKING:
+
+        def __iter__(self) -> Iterator[M]: ...
+
+        @overload
+        def __getitem__(self, idx: int) -> M: ...
+
+        @overload
+        def __getitem__(self, idx: slice) -> "ModulesOf[M]": ...
+
+        def __getitem__(self, idx: int | slice) -> "M | ModulesOf[M]": ...
 
 
 class Mergeable(BufferModule, ABC):
