@@ -299,8 +299,8 @@ def test_places_of_a_map_whose_run_is_gone_have_no_pictures(runs, tmp_path):
     own = page.arrays["place_session"] == 1
     assert ((page.arrays["place_picture"] >= 0) == own).all()
     assert page.about["picture_notes"] == [
-        f"No pictures of {(~own).sum()} experiences: the folder of the run that made them has been "
-        "where it was."
+        f"No pictures of {(~own).sum()} experiences: the folder of the run that made them "
+        "has been moved or deleted."
     ]
 
 
