@@ -259,7 +259,7 @@ for column, glances, title in zip(axes.T, (1, 5), ("One view", "Five views"), st
     cells = network(inject_after=0)
     for template in range(5):  # learnt along a line from x = 13.4 to x = 14.6
         place(cells, 13.4 + 0.3 * template, 10.0, 0.0)
-        cells.see(new(template))
+        cells.update_from_view(new(template))
     place(cells, 4.0, 10.0, 0.0)
     strip, found = [], []
     for step in range(160):
@@ -299,7 +299,7 @@ cells(STILL, UNSEEN)
 added = []
 for step in range(80):
     shown = step < 5 or step >= 75
-    cells.see(known(0) if shown else UNSEEN)
+    cells.update_from_view(known(0) if shown else UNSEEN)
     added.append(cells.packet.values.sum().item() - 1.0 if shown else np.nan)
     cells.integrate(STILL)
 figure, axes = plt.subplots(figsize=(8, 2.8))

@@ -11,11 +11,12 @@ from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
+    check_image,
     check_instant,
-    check_picture,
     checked_number,
     checked_odometry,
 )
+from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
 from neuroslam.state.sessions import Session, session_id
 from neuroslam.types import (
@@ -96,10 +97,13 @@ class NavigationBrain(BrainState):
         accepted = self._accept(frame)
         now = self._enter(accepted)
         observed, leader = accepted.observed, self.leader
-        made = [(p, p.step(now, observed[p.kind])) for p in self._with["step"]]
+        made: list[tuple[Population | None, Correction | None]] = [
+            (p, p.step(now, observed[p.kind])) for p in self._with["step"]
+        ]
         if self._compass_turns_map:
             made.append((None, self.compass.step(now.compass_rad, now.motion)))
-        decision = cells = None
+        decision: Decision | None = None
+        cells: Any = None  # until the leader has decided
         if leader.relaxes_map:
             if any(p.vetoes(now.view) for p in self._with["vetoes"]):
                 now = now._replace(vetoed=True)
@@ -123,12 +127,12 @@ class NavigationBrain(BrainState):
             if self._has_compass and frame.heading_rad is not None:
                 checked_number(frame.heading_rad, "heading", "rad")
             if frame.image is not None:
-                check_picture(frame.image)
+                check_image(frame.image)
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None
             if self._makes_views and frame.image is not None:
-                view = self.view.look(frame.image)
+                view = self.view.usable_view(frame.image)
             velocity, profiles = self._velocity(frame, dt_s)
             gap = dt_s > self.config.max_gap_s
             if not gap and self._with["check"]:  # after a gap a new map begins
@@ -156,14 +160,14 @@ class NavigationBrain(BrainState):
                 velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
-        match = BLIND if view is None else self.view.recognise(view)
+        match = BLIND if view is None else self.view.match_or_learn(view)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""
-        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
         leader = self.leader
@@ -185,8 +189,8 @@ class NavigationBrain(BrainState):
         self._after_gap_s = -math.inf
         self.sessions.now.frames += 1
         lost = any(population.lost for population in self._populations.values())
-        arrived = accepted.view is not None and action in ("create", "link")
-        if arrived and self._recognise(frame, accepted.view, view):
+        encoded, arrived = accepted.view, action in ("create", "link")
+        if arrived and encoded is not None and self._recognise(frame, encoded, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.leader.estimate, "set", self.map.current
         return StepResult(
@@ -206,7 +210,7 @@ class NavigationBrain(BrainState):
 
     def _name_session(self, frame: Frame, observed: dict[str, Any]) -> None:
         """Open a session; its id is a hash of config, source and first frame."""
-        found = []
+        found: list[Any] = []
         for observation in observed.values():
             found += observation if isinstance(observation, tuple) else [observation]
         self._open(

@@ -97,7 +97,7 @@ def _of_one_session(
     brain.sessions.sessions.append(Session(session, frames=int(tensors["clock.frames_seen"])))
     fresh = brain.state_dict()
     experiences, blocks = "map.experiences.template", "view.templates.blocks"
-    tensors = {name: tensors.get(name, value) for name, value in fresh.items()}
+    tensors = {name: tensors[name] if name in tensors else fresh[name] for name in fresh}
     n = len(tensors[experiences])
     tensors["map.experiences.session"] = torch.full((n,), session)
     tensors["map.experiences.number"] = torch.arange(n)

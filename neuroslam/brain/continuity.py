@@ -20,6 +20,20 @@ _STEP = 0.02
 """Relative step of the running median per frame."""
 
 
+class Change(Scalars):
+    """How the views of a drive change.
+
+    Attributes:
+        frames: How many were compared.
+        usual: Running median of the change between two.
+        turned: By how many columns of a view the robot turned since the last one.
+    """
+
+    frames: int
+    usual: float
+    turned: float
+
+
 class Continuity(AboutNow):
     r"""Decides from two successive views whether the robot was kidnapped between them.
 
@@ -38,7 +52,7 @@ class Continuity(AboutNow):
         self.shift = math.inf if config.view.panoramic else config.view.shift_match
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
         self.geometry = Geometry.of(config.view)
-        self.state = Scalars(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
+        self.state = Change(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
         n_pixels = config.view.template_width * config.view.template_height
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 

@@ -51,12 +51,18 @@ class StoredViews:
         return min(self.joined.differences(view, rest), default=None)
 
 
+class Arrivals(Scalars):
+    """How often the robot has come to a place."""
+
+    arrivals: int
+
+
 class Recognition(Mergeable):
     """Recent view matches with stored maps: the evidence for joining one."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.state = Scalars(arrivals=0)
+        self.state = Arrivals(arrivals=0)
         integers = ("arrival", "map", "loaded", "partial")
         self.sightings = GrowingTable(
             {name: ((), torch.int64) for name in integers}
@@ -65,8 +71,7 @@ class Recognition(Mergeable):
         # For each stored map: number of matched experiences, and the most that agreed.
         self.tally = GrowingTable({"alike": ((), torch.int64), "agreed": ((), torch.int64)})
 
-    @staticmethod
-    def merged(_loaded: State, partial: State, _join: Join) -> State:
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Drop all matches: the ids have changed."""
         return {
             name: value if name.startswith("state.") else value[:0]

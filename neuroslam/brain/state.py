@@ -23,7 +23,7 @@ from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.state.match import Match
-from neuroslam.state.mergeable import AboutNow, Mergeable, State
+from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
 from neuroslam.state.population import Population
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
@@ -70,6 +70,7 @@ class BrainState(nn.Module):
     sessions: SessionLog
     recognition: Recognition
     continuity: Continuity
+    stored: "ModulesOf[Self]"
 
     def __init__(
         self, config: BrainConfig | None = None, *, features: nn.Module | Encoder | None = None
@@ -77,11 +78,12 @@ class BrainState(nn.Module):
         super().__init__()
         self.config = config or BrainConfig()
         self._encoder = view_encoder(self.config.view, features)
-        self.about = ("", "", "")  # source, preset and date of the next session
+        # Source, preset and date of the next session.
+        self.about: tuple[str, str, str] = ("", "", "")
         self._detects = self.config.sessions.kidnapped == "detect"
         self._after_gap_s = -math.inf  # time of a frame that was refused after a gap
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
-        self.stored = nn.ModuleList()
+        self.stored = ModulesOf()
         self._begin()
         self.register_load_state_dict_pre_hook(_make_stored)
         self.register_load_state_dict_post_hook(lambda module, _: module._changed())
@@ -235,7 +237,7 @@ class BrainState(nn.Module):
     def restore(self, state: State, stored: Sequence[Self]) -> None:
         """Replace the state and the stored maps."""
         self._begin()
-        self.stored = nn.ModuleList(stored)
+        self.stored = ModulesOf(stored)
         own = {name: value for name, value in state.items() if not name.startswith("stored.")}
         for i, one in enumerate(stored):
             own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
@@ -289,7 +291,7 @@ class BrainState(nn.Module):
         """Join stored map ``where``, and then those that share a session with it."""
         rest = [one for i, one in enumerate(self.stored) if i != where]
         loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
-        self.stored = nn.ModuleList()  # the other stored maps are not copied
+        self.stored = ModulesOf()  # the other stored maps are not copied
         merged, report = loaded.merge(self, match)
         self.stored = everything
         report.at_frame = frame.index
@@ -301,7 +303,7 @@ class BrainState(nn.Module):
         for name, part in merged.parts().items():
             setattr(self, name, part)
         self.view.encoder = self._encoder
-        self.stored = nn.ModuleList(rest)
+        self.stored = ModulesOf(rest)
         rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
         for i, (alike, agreed) in enumerate(rows):
             if i != where:
@@ -361,4 +363,4 @@ def _make_stored(module: BrainState, state: State, prefix: str, *_unused: object
     inside = f"{prefix}stored."
     numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
     if len(numbers) != len(module.stored):
-        module.stored = nn.ModuleList(type(module)(module.config) for _ in numbers)
+        module.stored = ModulesOf(type(module)(module.config) for _ in numbers)

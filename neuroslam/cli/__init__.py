@@ -4,10 +4,10 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO, cast
 
 # One thread is faster for the small arrays of a brain; libraries read this when they are loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -34,7 +34,7 @@ from neuroslam.errors import NeuroslamError, RenamedKeyWarning
 class _Commands(TyperGroup):
     """Group of commands whose interruption :func:`main` reports; typer reports none."""
 
-    def invoke(self, ctx: typer.Context) -> object:
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - a type that typer keeps to itself
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -69,7 +69,7 @@ def _options(
     """Options of no particular command."""
 
 
-_COMMANDS = {
+_COMMANDS: dict[str, Callable[..., int]] = {
     "run": run_command,
     "resume": resume_command,
     "merge": merge_command,
@@ -113,11 +113,19 @@ def _warnings_in_one_line(command: str) -> Iterator[None]:
     """Print each warning about a renamed key once, in one line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", RenamedKeyWarning)
-        python, printed = warnings.showwarning, set()
+        python = warnings.showwarning
+        printed: set[str] = set()
 
-        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:  # noqa: ANN401
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
             if not issubclass(category, RenamedKeyWarning):
-                python(message, category, *place)
+                python(message, category, filename, lineno, file, line)
             elif str(message) not in printed:
                 printed.add(str(message))
                 complain(command, f"note: {message}")
@@ -137,7 +145,7 @@ def main(argv: list[str] | None = None) -> int:
         complain(command, "interrupted")
         return INTERRUPTED
     except typer.TyperException as error:
-        error.show()
+        cast(Any, error).show()  # what typer raises can, though its public base class cannot
         return USER_ERROR
     except NeuroslamError as error:
         complain(command, str(error))

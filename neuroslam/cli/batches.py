@@ -55,10 +55,10 @@ def sweep_command(
 
     so_far = (0, 0)
 
-    def note(*done_and_total: int) -> None:
+    def note(done: int, total: int) -> None:
         nonlocal so_far
-        so_far = done_and_total
-        on_done("runs", *so_far)
+        so_far = done, total
+        on_done("runs", done, total)
 
     with show_runs("sweep") as on_done:
         try:

@@ -206,7 +206,7 @@ def _print_not_joined(summary: "RunSummary") -> None:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    from neuroslam.merging.merge import MergeReport
+    from neuroslam.merging.report import MergeReport
 
     first, *others = MergeReport(**report).lines()
     at = "" if report["at_frame"] is None else f"frame {report['at_frame']}: "

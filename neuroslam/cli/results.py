@@ -1,7 +1,7 @@
 """Commands on results: inspect, verify, export, evaluate, plot, report."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.table import Table
@@ -9,6 +9,9 @@ from rich.table import Table
 from neuroslam.cli.options import MapFile, RunFolder
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
+
+if TYPE_CHECKING:
+    from neuroslam.evaluation.trajectory import AlignmentMode
 
 
 def inspect_command(path: MapFile) -> int:
@@ -62,7 +65,8 @@ def evaluate_command(
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []
-    for name, found, unit in evaluate(track, truth, align, notes.append):
+    mode = cast("AlignmentMode", align)  # looked at there
+    for name, found, unit in evaluate(track, truth, mode, notes.append):
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     say(table)
     for note in notes:

@@ -42,8 +42,10 @@ def tune_command(
     for note in tuning.notes:
         say(note)
     for name, trial in (("before", tuning.before), ("tuned", tuning.after)):
+        if trial is None:
+            continue
         say(
-            f"{name}: {trial.n_places} experiences, {trial.n_links} links, "
+            f"{name}: {trial.n_experiences} experiences, {trial.n_links} links, "
             f"inconsistency {shown(trial.inconsistency) or 'unknown'} (0: consistent, 1: useless)"
         )
     say(tuning.verdict)

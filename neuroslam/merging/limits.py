@@ -7,7 +7,7 @@ import numpy as np
 
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import Tolerance, misfits_m
+from neuroslam.mapping.overlap import Tolerance, pair_residuals_m
 from neuroslam.state.match import Pairs
 
 WINDOW = 3
@@ -32,7 +32,8 @@ def elsewhere(of: ExperienceMap, experience: int, limits: Tolerance) -> np.ndarr
     """Return which experiences are too far from one for their views to be similar by proximity."""
     poses = of.poses
     apart = np.linalg.norm((poses - poses[experience])[:, :2], axis=1)
-    return apart > limits.near_m / (2.0 * WINDOW)
+    far: np.ndarray = apart > limits.near_m / (2.0 * WINDOW)
+    return far
 
 
 def far_off(
@@ -47,4 +48,5 @@ def far_off(
     """
     path_m = partial.path_lengths_m(int(pairs.partial[0]))[pairs.partial]
     path_m = path_m + loaded.path_lengths_m(int(pairs.loaded[0]))[pairs.loaded]
-    return misfits_m(pairs, partial.poses, loaded.poses), limits.place_m + limits.drift * path_m
+    residuals_m = pair_residuals_m(pairs, partial.poses, loaded.poses)
+    return residuals_m, limits.place_m + limits.drift * path_m

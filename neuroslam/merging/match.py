@@ -138,7 +138,7 @@ def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
     """
     mine, theirs = loaded.map.origins(), partial.map.origins()
     keys = [origin_key(o._asdict()) for o in (mine, theirs)]
-    _, i, j = np.intersect1d(*keys, return_indices=True)
+    _, i, j = np.intersect1d(keys[0], keys[1], return_indices=True)
     if not len(i):
         return None
     one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
@@ -176,7 +176,8 @@ def _pixels(brain: Mapped, experiences: np.ndarray) -> np.ndarray:
     views = brain.map.experiences["template"].numpy()[experiences]
     if not brain.view.n:
         return np.zeros((len(experiences), 1))
-    return brain.view.templates["pixels"].numpy(force=True)[views].reshape(len(experiences), -1)
+    pixels: np.ndarray = brain.view.templates["pixels"].numpy(force=True)
+    return pixels[views].reshape(len(experiences), -1)
 
 
 def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:

@@ -66,15 +66,15 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     report.reason = _beyond_odometry(loaded, partial, match)
     if report.reason:
         return Merged(None, None, report)
-    states = [
+    one, other = (
         {n: value.cpu() for n, value in brain.state_dict().items() if not n.startswith("stored.")}
         for brain in (loaded, partial)
-    ]
-    state, join = merge_states(*states, match, partial.config, partial.parts())
+    )
+    state, join = merge_states(one, other, match, partial.config, partial.parts())
     merged = ExperienceMap(partial.map.config, partial.map.torus, partial.map.threshold_cells)
     merged.load_state_dict(part_of(state, "map"))
     if not partial.leader.relaxes_map:
-        merged.measure_links()  # a merged place cell has the position of the loaded one
+        merged.reset_links()  # a merged place cell has the position of the loaded one
         state |= {f"map.{name}": value for name, value in merged.state_dict().items()}
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded.map, partial, merged, join)

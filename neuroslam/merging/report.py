@@ -39,7 +39,7 @@ class MergeReport:
     cell_shift: list[float] = field(default_factory=list)
     rotation_rad: float | None = None
     translation_m: list[float] = field(default_factory=list)
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    counts: dict[str, dict[str, float]] = field(default_factory=dict)
     residual_before_m: float | None = None
     residual_after_m: float | None = None
     largest_correction_m: float | None = None
@@ -52,8 +52,8 @@ class MergeReport:
     def lines(self) -> list[str]:
         """Return the report as text, one fact per line."""
         lines = [f"{'merged' if self.merged else 'not merged'}: {self.reason}"]
-        if self.match:
-            m = self.match
+        m = self.match or {}
+        if m:
             lines.append(
                 f"match: experience {m['partial_experience']} (frame {m['partial_frame']}) is "
                 f"experience {m['loaded_experience']} (frame {m['loaded_frame']}); "
@@ -61,7 +61,7 @@ class MergeReport:
             )
         if self.found:
             lines.append(f"found: {self.found}")
-        by_views = self.match and self.match["error"] is not None
+        by_views = m.get("error") is not None
         if by_views:
             runner_up = "none" if m["runner_up"] is None else f"{m['runner_up']:.4f}"
             lines.append(f"match error: {m['error']:.4f}, smallest elsewhere {runner_up}")

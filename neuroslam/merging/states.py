@@ -151,11 +151,11 @@ def merge_states(
     join = make_join(loaded, partial, match, config, parts)
     merged: State = {}
     for name, part in parts.items():
-        states = [part_of(state, name) for state in (loaded, partial)]
+        one, other = part_of(loaded, name), part_of(partial, name)
         with torch.no_grad():
-            result = part.merged(*states, join)
-        if set(result) != set(states[1]):
-            missing = sorted(set(result) ^ set(states[1]))
+            result = part.merged(one, other, join)
+        if set(result) != set(other):
+            missing = sorted(set(result) ^ set(other))
             raise MapError(f"merge: {name} has no rule for {', '.join(missing)}; extend merged()")
         merged |= {f"{name}.{key}": value for key, value in result.items()}
     unmerged = sorted(key for key in partial if key not in merged and not key.startswith("stored."))

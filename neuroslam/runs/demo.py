@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from neuroslam.runs.reading import odometry_track, read_frames, read_plan, read_
 from neuroslam.runs.results import RunSummary
 from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
-from neuroslam.types import StepResult
+from neuroslam.types import PoseEstimate, StepResult
 
 WORLD = "world:corridor?laps=2&noise=0.05&light=0.3&people=4"
 FIRST_STOP, SECOND_START = 240, 290
@@ -126,7 +127,7 @@ def draw_summary(out: str | Path, path: Path) -> None:
         np.column_stack([links.source, links.target]),
         frames,
         activity=cells.activity.numpy(),
-        estimate=cells.estimate,
+        estimate=cast(PoseEstimate, cells.estimate),
         image=last.image,
         template=brain.view.template_image(seen) if seen >= 0 else None,
         threshold=brain.config.view.threshold,

@@ -48,7 +48,7 @@ def evaluate(
     else:
         trace = None if out is None else read_trace(out, len(found.times_s))
         true_track = None if trace is None else true_poses(trace)
-        if true_track is None:
+        if trace is None or true_track is None:
             raise RunError(
                 f"{track}: its source has no ground truth; give a TUM file with --truth FILE"
             )

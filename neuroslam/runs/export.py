@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file
 from neuroslam.runs.reading import track_file
 from neuroslam.spiking.export import export_nir
+from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.state.files import write_atomically
 from neuroslam.state.sessions import session_name
 
@@ -141,10 +143,10 @@ def _write_nir(brain: NavigationBrain, to: Path) -> None:
             f"{to}: the brain has no spiking neurons; run with semantic cells and "
             "--set semantic.tier=spiking"
         )
-    export_nir(brain.semantic.slam.integrator, to)
+    export_nir(cast(PathIntegrator, brain.semantic.slam.integrator), to)
 
 
-def _add_data(element: ElementTree.Element, columns: dict[str, list], row: int) -> None:
+def _add_data(element: ElementTree.Element, columns: dict[str, list[Any]], row: int) -> None:
     for name, values in columns.items():
         ElementTree.SubElement(element, "data", key=name).text = str(values[row])
 

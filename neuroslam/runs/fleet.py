@@ -174,7 +174,7 @@ def _merge(pair: _Pair) -> list[dict[str, Any]]:
 
 
 def _collect(
-    function: Callable,
+    function: Callable[[Any], Any],
     orders: Sequence[Any],
     jobs: int | None,
     ray: str | None,
@@ -279,7 +279,7 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
     if stages:
         stages.sort(key=lambda stage: not stage[0])
         title = f"A fleet of {len(report.sessions)}"
-        if report.merged:
+        if most is not None and report.merged:
             title += f": {len(most.sessions)} sessions on one map"
         title += f", {len(report.apart)} apart" if report.apart else ""
         title += f", {len(report.failed)} failed" if report.failed else ""

@@ -148,8 +148,9 @@ class NavigationPanels(Panels):
             axes = figure.subplots()
             order = np.argsort(self._boundary, kind="stable")
             dots = axes.scatter(
-                *at[order].T, c=np.array(self._boundary)[order], s=4, lw=0, cmap=ACTIVITY, vmin=0.0
-            )
+                at[order, 0], at[order, 1], c=np.array(self._boundary)[order],
+                s=4, lw=0, cmap=ACTIVITY, vmin=0.0,
+            )  # fmt: skip
             figure.colorbar(dots, ax=axes, label="rate of the most active cell")
             axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
         return figure

@@ -9,12 +9,12 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import torch
@@ -55,7 +55,7 @@ def parallel_map(
 
 def outcomes(
     function: Callable[[T], R], items: Sequence[T], jobs: int | None = None, ray: str | None = None
-) -> Iterator[tuple[int, R | NeuroslamError]]:
+) -> Generator[tuple[int, R | NeuroslamError], None, None]:
     """Yield the number and the outcome of each item as it ends; close to cancel the rest.
 
     Args:
@@ -118,7 +118,7 @@ def _in_processes(
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
     lost: list[int] = []
     with _workers(min(jobs, len(numbered))) as pool:
-        futures: dict[Future, int] = {}
+        futures: dict[Future[R | NeuroslamError], int] = {}
         with _interrupts_wait():
             for number, item in numbered.items():
                 try:
@@ -194,6 +194,7 @@ def _on_ray(
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
     try:
         import ray
+        from ray.exceptions import OutOfMemoryError, WorkerCrashedError
     except ImportError as error:
         raise RunError(
             f"Ray cannot be imported ({error}); pip install neuroslam[sweep], or omit --ray"
@@ -201,9 +202,9 @@ def _on_ray(
     started_here = not ray.is_initialized()
     if started_here:
         _connect(ray, address, jobs)
-    running: dict[ray.ObjectRef, int] = {}
+    running: dict[Any, int] = {}
     try:
-        task = ray.remote(num_cpus=1, max_retries=0)(_attempt)
+        task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt)
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
@@ -213,7 +214,7 @@ def _on_ray(
             number = running.pop(done)
             try:
                 outcome = ray.get(done)
-            except (ray.exceptions.WorkerCrashedError, ray.exceptions.OutOfMemoryError):
+            except (WorkerCrashedError, OutOfMemoryError):
                 outcome = _died()
             yield number, outcome
     finally:

@@ -4,7 +4,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,6 +25,8 @@ from neuroslam.runs.reading import (
     trajectory,
     true_poses,
 )
+from neuroslam.state.answers import pictures_of
+from neuroslam.types import PoseEstimate
 
 _TITLE_WIDTH = 90  # characters
 
@@ -45,12 +47,12 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
         to.mkdir(parents=True, exist_ok=True)
         draw_map(brain, plan, trace, to / "map.png")
         path = trajectory(brain, trace)[:, :2]
-        figures = {}
+        figures: dict[str, Figure] = {}
         for kind, population in brain.populations.items():
             if kind in _DRAWN:
                 figures |= _DRAWN[kind](population, path)
             else:
-                for tag, picture in population.images().items():
+                for tag, picture in pictures_of(population).items():
                     figures[f"{tag.replace('/', '_')}.png"] = plot_activity(picture, tag)
         figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():
@@ -61,7 +63,11 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
 
 
 def _draw_pose_cells(cells: PoseCellNetwork, _path: np.ndarray) -> dict[str, Figure]:
-    return {"pose_cells.png": plot_pose_cells(cells.activity.numpy(), cells.estimate)}
+    return {
+        "pose_cells.png": plot_pose_cells(
+            cells.activity.numpy(), cast(PoseEstimate, cells.estimate)
+        )
+    }
 
 
 def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Figure]:

@@ -207,7 +207,7 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     """
     path = Path(out) / "metrics.json"
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         for name in _FIGURES:
             metrics[name]
     except FileNotFoundError:

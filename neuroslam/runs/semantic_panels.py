@@ -131,7 +131,7 @@ class LandmarkQuery(NamedTuple):
 def known_landmarks(cells: SemanticCells) -> LandmarkQuery:
     """Return the landmarks seen most often, at their recalled positions."""
     table = cells.landmarks()
-    rows = np.flatnonzero(cells.confirmed().numpy(force=True))
+    rows = np.flatnonzero(cells.known.confirmed().numpy(force=True))
     order = np.sort(np.argsort(-table["seen"], kind="stable")[:_QUERIED])
     names, positions = [str(name) for name in table["name"][order]], table["place_m"][order]
     around = np.vstack([positions, [cells.pose[:2]]])

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from neuroslam.config import BrainConfig
+from neuroslam.config.populations import section_class
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
@@ -27,7 +28,7 @@ _SEEDS = {
     "place": ("grid_cells.seed",),
     "semantic": ("semantic.seed", "semantic.space.seed"),
 }
-"""Kind of a population -> parameters that are its seeds."""
+"""Kind of a population -> parameters that are its seeds; of others, ``seed`` of their section."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def plan_sweep(
 def _trial(
     number: int,
     total: int,
-    combination: tuple,
+    combination: tuple[Any, ...],
     keys: tuple[str, ...],
     many_sources: bool,
     preset: str | None,
@@ -158,7 +159,7 @@ def _trial(
         )  # an error in these is reported as theirs
         raise
     if seed is not None:
-        over = [key for cells in settings.cells for key in _SEEDS.get(cells, ()) if key not in keys]
+        over = [key for kind in settings.cells for key in _seeds_of(kind) if key not in keys]
         settings = resolve_config(None, None, tuple(f"{key}={seed}" for key in over), settings)
         seeded = seeded_spec(source, seed)
         if seeded == source and not over:
@@ -177,6 +178,14 @@ def _trial(
         words += ["seed", str(seed)]
     folder = re.sub(r"[^\w.+]+", "-", "-".join(words)).strip("-.")[:80]
     return Trial(f"{number:0{len(str(total))}d}-{folder}", source, varied, settings)
+
+
+def _seeds_of(kind: str) -> tuple[str, ...]:
+    """Name the seeds of a population."""
+    section = section_class(kind)
+    if section is not None and "seed" in section.model_fields:
+        return (f"{kind}.seed",)
+    return _SEEDS.get(kind, ())
 
 
 def sweep(
@@ -242,11 +251,11 @@ def sweep(
                 if on_done is not None:
                     on_done(len(found), len(trials))
     finally:
+        rows = [
+            {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
+            for k, trial in enumerate(trials)
+        ]
         if found:
-            rows = [
-                {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
-                for k, trial in enumerate(trials)
-            ]
             _write(out, rows, [key for key in varied(rows) if key not in ("run", "seed")])
     return rows
 
@@ -271,7 +280,7 @@ def claim(out: Path, summary: str, overwrite: bool) -> None:
 
 def _map(order: _Order) -> dict[str, Any]:
     trial = order.trial
-    arguments = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    arguments: dict[str, Any] = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
     arguments |= {"start": order.start, "stop": order.stop}
     return run_one(trial.source, order.out / trial.name, trial.config, **arguments)
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, read_checkpoint
 from neuroslam.config import BrainConfig
-from neuroslam.errors import NeuroslamError, counted, listed
+from neuroslam.errors import NeuroslamError, counted, first_line, listed
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links
@@ -24,6 +24,7 @@ from neuroslam.runs.files import (
     missing_rows,
 )
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
+from neuroslam.state.answers import tables_of
 from neuroslam.state.mergeable import State
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, session_name
@@ -62,6 +63,10 @@ def verify(path: str | Path) -> list[str]:
         faults.append(f"stored maps are numbered {sorted(numbers)}; expected 0, 1, ...")
     if faults:
         return faults  # other checks need complete tensors
+    try:
+        model.load_state_dict(state)
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        return [f"its state does not fit its config ({first_line(error)})"]
     faults = [f"{where}{fault}" for where, part in parts for fault in _faults(part, config)]
     tallies = len(state["recognition.tally.alike"])
     if tallies != len(numbers):
@@ -70,7 +75,6 @@ def verify(path: str | Path) -> list[str]:
             f"expected {counted(len(numbers), 'row')}, one per stored map"
         )
     if path.is_dir() and not faults:  # files cannot agree with a faulty brain
-        model.load_state_dict(state)
         faults = list(_folder_faults(path, model))
     return faults
 
@@ -115,8 +119,10 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         if tensor.is_floating_point():
             wrong = tensor.isnan() if name in _MAY_BE_INFINITE else ~tensor.isfinite()
             if wrong.any():
-                rows = np.unique(wrong.numpy().nonzero()[0]) if tensor.dim() else []
-                yield f"{name}: not finite" + (f" in rows {listed(rows)}" if tensor.dim() else "")
+                where = ""
+                if tensor.dim():
+                    where = f" in rows {listed(np.unique(wrong.numpy().nonzero()[0]))}"
+                yield f"{name}: not finite{where}"
     n_views, n = len(s["view.templates.pixels"]), len(s["map.experiences.template"])
     for name, limit, what in (
         ("map.experiences.template", n_views, "templates"),
@@ -230,7 +236,7 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "links.csv": links_csv(brain.map.links),
     }
     for population in brain.populations.values():
-        expected |= population.tables()
+        expected |= tables_of(population)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:

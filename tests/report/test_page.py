@@ -377,3 +377,25 @@ def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):
     place = page.evaluate("map.nearest(400, 300, 1e9)")
     page.mouse.click(*on_screen(page, place))
     assert page.evaluate("chosen.place") == place
+
+
+def test_populations_show_their_counts_and_their_pictures_as_they_are(show, tmp_path):
+    config = BrainConfig(cells="pose+head_direction+speed")
+    run(WORLD, tmp_path / "run", config, stop=30, tensorboard=False)
+    write_report(tmp_path / "run")
+    page = show(tmp_path / "run" / "report.html")
+    cards = page.locator("#population-list .card")
+    assert cards.locator("h3").all_inner_texts() == ["head direction", "speed"]
+    assert cards.nth(1).locator("dd").first.inner_text() == "32"
+    images = page.locator("#population-list img")
+    sizes = images.evaluate_all("all => all.map(i => [i.naturalWidth, i.naturalHeight, i.width])")
+    assert sizes == [[65, 65, 260], [32, 1, 256]]
+    assert set(images.evaluate_all("all => all.map(i => getComputedStyle(i).imageRendering)")) == {
+        "pixelated"
+    }
+    assert page.locator("#to-populations").is_visible()
+
+
+def test_where_the_page_draws_all_populations_itself_there_is_no_such_section(page):
+    assert not page.locator("#populations").is_visible()
+    assert not page.locator("#to-populations").is_visible()
