@@ -394,15 +394,15 @@ def test_a_brain_that_cannot_be_loaded_is_named_and_left_as_it_is(damage, cause,
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
-        ("config.toml", None, r"config\.toml: is missing, and says what the run reads"),
-        ("config.toml", b"[view]\n", r"config\.toml: has no usable \[run\] table"),
-        ("config.toml", b"\xff\xfe", r"config\.toml: has no usable \[run\] table"),
-        ("metrics.json", None, r"metrics\.json: missing; is "),
+        ("config.toml", None, r"config\.toml: missing; it holds the source of the run"),
+        ("config.toml", b"[view]\n", r"config\.toml: has no valid \[run\] table"),
+        ("config.toml", b"\xff\xfe", r"config\.toml: has no valid \[run\] table"),
+        ("metrics.json", None, r"metrics\.json: missing; expected the folder of a run"),
         ("metrics.json", b"[]", r"metrics\.json: damaged"),
         ("frames.csv", None, r"frames\.csv: .*cannot resume"),
         ("frames.csv", b"frame\n0\n", r"frames\.csv: damaged, 0 whole rows; .* seen 12 frames"),
         ("trace.f64", None, r"trace\.f64: .*cannot resume"),
-        ("trace.f64", b"12345", r"trace\.f64: shorter than the run"),
+        ("trace.f64", b"12345", r"trace\.f64: 0 rows, the brain has seen 12 frames"),
     ],
 )
 def test_a_part_of_a_run_that_is_missing_or_damaged_is_named(
@@ -438,10 +438,10 @@ def test_every_reader_reports_an_incomplete_row_alike(cut, earlier, mistake):
 @pytest.mark.parametrize(
     ("file", "inside", "told"),
     [
-        ("sweep.json", "1-a/frames.csv", "a sweep; its runs are folders in it, as {}/1-a"),
-        ("fleet.json", "merged/frames.csv", "a fleet; its map is in {}/merged"),
+        ("sweep.json", "1-a/frames.csv", "a sweep; expected one of its runs, which are folders in it, e.g. {}/1-a"),
+        ("fleet.json", "merged/frames.csv", "a fleet; its merged map is in {}/merged"),
         ("fleet.json", "sessions/1/frames.csv", "a fleet; its maps are in {}/sessions"),
-        ("tune.json", "config.toml", "a tuning; use it as --config {}/config.toml"),
+        ("tune.json", "config.toml", "a tuning; use its config with --config {}/config.toml"),
     ],
 )
 def test_a_folder_of_many_runs_is_not_taken_for_a_run(file, inside, told, tmp_path, mistake):
@@ -468,14 +468,14 @@ def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
     (tmp_path / "half.tum").write_text("".join(rows[:6]))
     done = call("evaluate", finished, "--truth", tmp_path / "half.tum")
     assert (done.code, done.err) == (0, "")
-    assert done.out.endswith("6 of 12 frames have truth; the errors are theirs\n")
+    assert done.out.endswith("6 of 12 frames have a true pose; the errors are over those\n")
     assert "have truth" not in call("evaluate", finished).out
 
 
 def test_evaluate_asks_for_a_truth_where_there_is_none(finished, tmp_path, call, mistake):
     source = motion(tmp_path / "log.csv", LINES)
     assert call("run", source, "-o", tmp_path / "run", QUICK).code == 0
-    assert "give one with --truth FILE" in mistake("evaluate", tmp_path / "run")
+    assert "give a TUM file with --truth FILE" in mistake("evaluate", tmp_path / "run")
     assert "nowhere.tum" in mistake("evaluate", tmp_path / "run", "--truth", "nowhere.tum")
     assert "--align rgid: expected one of " in mistake("evaluate", finished, "--align", "rgid")
     (tmp_path / "run" / "trace.f64").write_bytes(b"12345")

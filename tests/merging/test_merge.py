@@ -842,10 +842,10 @@ def test_maps_made_with_other_views_or_cells_are_refused_and_the_keys_named():
 @pytest.mark.parametrize(
     ("match", "which"),
     [
-        (Match(9, 0), "place 9 of the loaded map; it has 9"),
-        (Match(0, 9), "place 9 of the partial map; it has 9"),
-        (Match(-1, 0), "place -1 of the loaded map"),
-        (Match(0, 0, others=Pairs.of([(12, 1, 0.0, 0.0)])), "place 12 of the partial map"),
+        (Match(9, 0), "experience 9 of the loaded map; expected 0 to 8"),
+        (Match(0, 9), "experience 9 of the partial map; expected 0 to 8"),
+        (Match(-1, 0), "experience -1 of the loaded map"),
+        (Match(0, 0, others=Pairs.of([(12, 1, 0.0, 0.0)])), "experience 12 of the partial map"),
     ],
 )
 def test_a_match_that_names_a_missing_place_is_a_mistake_that_is_named(match, which):

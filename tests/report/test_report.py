@@ -425,7 +425,7 @@ def damaged(runs, tmp_path, name, change):
     [
         ("metrics.json", lambda p: p.unlink(), "metrics.json: missing"),
         ("metrics.json", lambda p: p.write_text("{}"), "metrics.json: damaged"),
-        ("config.toml", lambda p: p.unlink(), "config.toml: is missing"),
+        ("config.toml", lambda p: p.unlink(), "config.toml: missing"),
         ("frames.csv", lambda p: p.unlink(), "frames.csv: missing"),
         ("frames.csv", lambda p: p.write_text("frame\n0\n"), "frames.csv: damaged"),
         ("frames.csv", lambda p: p.write_bytes(b"\xff\xfe\n\xff"), "frames.csv: damaged"),
