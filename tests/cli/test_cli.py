@@ -438,7 +438,11 @@ def test_every_reader_reports_an_incomplete_row_alike(cut, earlier, mistake):
 @pytest.mark.parametrize(
     ("file", "inside", "told"),
     [
-        ("sweep.json", "1-a/frames.csv", "a sweep; expected one of its runs, which are folders in it, e.g. {}/1-a"),
+        (
+            "sweep.json",
+            "1-a/frames.csv",
+            "a sweep; expected one of its runs, which are folders in it, e.g. {}/1-a",
+        ),
         ("fleet.json", "merged/frames.csv", "a fleet; its merged map is in {}/merged"),
         ("fleet.json", "sessions/1/frames.csv", "a fleet; its maps are in {}/sessions"),
         ("tune.json", "config.toml", "a tuning; use its config with --config {}/config.toml"),
