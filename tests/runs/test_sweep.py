@@ -284,5 +284,5 @@ def test_names_stand_side_by_side_and_what_else_is_varied_is_in_the_legend():
 
 
 def test_a_sweep_in_which_all_failed_has_no_figure():
-    with pytest.raises(ValueError, match="got 1 rows, none of a run that went well"):
+    with pytest.raises(ValueError, match="got 1 rows, expected one of a run that succeeded"):
         plot_sweep([row(error="no such file")], ["source"])
