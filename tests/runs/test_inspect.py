@@ -105,7 +105,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     brain, rows = load_brain(joined), inspect(joined)
     told = dict(rows)
     assert told["experiences"] == str(brain.map.n)
-    assert told["views"] == str(brain.view.n)
+    assert told["templates"] == str(brain.view.n)
     assert told["links"] == str(brain.map.n_links)
     assert told["loop closures"] == "1"  # where the two maps meet
     assert told["frames seen"] == "430"
@@ -143,7 +143,7 @@ def test_views_and_pose_cells_are_not_listed_for_a_brain_without(cells, tmp_path
     save_brain(NavigationBrain(BrainConfig(cells=cells)), tmp_path / "brain.safetensors")
     told = dict(inspect(tmp_path / "brain.safetensors"))
     assert told["cells"] == cells[0]
-    assert not {"view", "views", "pose cells"} & told.keys()
+    assert not {"view", "templates", "pose cells"} & told.keys()
 
 
 def put(name, row, value):
