@@ -126,7 +126,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     )
     assert told[f"session {second.name}"] == (
         f"{about}130 frames from frame 320, {made[second.id]} experiences "
-        f"({brain.map.aliases.n} of them known), began: start"
+        f"({brain.map.aliases.n} merged into those of other sessions), began: start"
     )
     text = told[f"merge at frame {merge['at_frame']}"]
     assert text.startswith(f"session {second.name} into {first.name}, 4 places agree, ")
