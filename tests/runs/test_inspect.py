@@ -134,7 +134,8 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     assert told["refused merges"] == "0"
     stored = brain.stored[0]
     assert told["stored map 0, not joined"].startswith(
-        f"sessions {stored.sessions.now.name}: {stored.view.n} templates, {stored.map.n} experiences, "
+        f"sessions {stored.sessions.now.name}: {stored.view.n} templates, "
+        f"{stored.map.n} experiences, "
     )
 
 
