@@ -400,8 +400,8 @@ def plugin(tmp_path, monkeypatch):
     path = tmp_path / "draws.py"
     path.write_text(PLUGIN)
     yield path
-    populations.registered.clear()
-    populations.registered.update(before)
+    for kind in populations.registered.keys() - before.keys() - populations.HOMES.keys():
+        del populations.registered[kind]
     for name in set(sys.modules) - modules:
         if name.startswith("neuroslam_plugin_"):
             del sys.modules[name]
