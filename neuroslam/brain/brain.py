@@ -71,6 +71,7 @@ class NavigationBrain(BrainState):
             :class:`~neuroslam.view.features.FeatureEncoder`.
 
     Example:
+        >>> from neuroslam.config import BrainConfig
         >>> from neuroslam.types import Frame, Velocity
         >>> brain = NavigationBrain(BrainConfig())
         >>> picture = torch.arange(160 * 120).reshape(120, 160).to(torch.uint8).numpy()
