@@ -11,11 +11,12 @@ from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
+    check_image,
     check_instant,
-    check_picture,
     checked_number,
     checked_odometry,
 )
+from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
 from neuroslam.state.sessions import Session, session_id
 from neuroslam.types import (
@@ -128,12 +129,12 @@ class NavigationBrain(BrainState):
             if self._has_compass and frame.heading_rad is not None:
                 checked_number(frame.heading_rad, "heading", "rad")
             if frame.image is not None:
-                check_picture(frame.image)
+                check_image(frame.image)
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None
             if self._makes_views and frame.image is not None:
-                view = self.view.look(frame.image)
+                view = self.view.usable_view(frame.image)
             velocity, profiles = self._velocity(frame, dt_s)
             gap = dt_s > self.config.max_gap_s
             if not gap and self._with["check"]:  # after a gap there is another map
@@ -161,14 +162,14 @@ class NavigationBrain(BrainState):
                 velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
-        match = BLIND if view is None else self.view.recognise(view)
+        match = BLIND if view is None else self.view.match_or_learn(view)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Let the map and all populations follow corrections, but for their authors."""
-        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
         leader = self.leader

@@ -35,27 +35,63 @@ _RELAXATIONS = 400
 class HeadDirectionConfig(Section):
     """Head-direction cells: a continuous attractor on a ring of directions."""
 
-    n: int = Field(120, ge=24, description="cells, evenly over the full turn")
+    n: int = Field(
+        default=120,
+        ge=24,
+        description="number of cells, preferred directions evenly over the full turn; larger: "
+        "slower, not more exact",
+    )
     excite_deg: float = Field(
-        30.0, ge=10, le=60, description="std of the excitation kernel; wider: broader tuning"
+        default=30.0,
+        ge=10,
+        le=60,
+        description="standard deviation of the excitation kernel; larger: broader tuning",
     )
     inhibition: float = Field(
-        0.3, ge=0.1, le=0.6, description="by all activity, a share of the strongest excitation"
+        default=0.3,
+        ge=0.1,
+        le=0.6,
+        description="inhibition by all other cells, as a share of the strongest excitation; "
+        "larger: narrower tuning",
     )
-    gain: float = Field(10.0, gt=0, description="of the response; larger: a sharper threshold")
-    exponent: float = Field(2.0, ge=1, description="of the response; larger: narrower tuning")
+    gain: float = Field(
+        default=10.0, gt=0, description="gain of the response function; larger: a sharper threshold"
+    )
+    exponent: float = Field(
+        default=2.0, ge=1, description="exponent of the response function; larger: narrower tuning"
+    )
     settle_s: float = Field(
-        2.0, gt=0, description="in which a weaker bump fades; longer: the stronger bump lasts"
+        default=2.0,
+        gt=0,
+        description="time constant in which the weaker of two bumps fades; larger: a cue needs "
+        "longer to win against the present heading",
     )
     compass_s: float = Field(
-        2.0, gt=0, description="in which a compass corrects; longer: its noise averages out"
+        default=2.0,
+        gt=0,
+        description="time constant in which a compass corrects the heading; larger: slower, "
+        "averages more noise",
     )
-    view_s: float = Field(0.5, gt=0, description="in which a known view corrects")
+    view_s: float = Field(
+        default=0.5,
+        gt=0,
+        description="time constant in which a known view corrects the heading; larger: slower",
+    )
     fatigue_s: float = Field(
-        0.5, gt=0, description="in which a view loses its effect that is seen on and on"
+        default=0.5,
+        gt=0,
+        description="time constant in which a view that stays in sight loses its effect; larger: "
+        "it corrects longer",
     )
-    inject_after: int = Field(10, ge=0, description="the newest so many views correct nothing")
-    precision: Literal["float32", "float64"] = Field("float64", description="of the activity")
+    inject_after: int = Field(
+        default=10,
+        ge=0,
+        description="number of newest views that never correct; larger: the robot must be away "
+        "longer before a view corrects the heading",
+    )
+    precision: Literal["float32", "float64"] = Field(
+        default="float64", description="number type of the activity"
+    )
 
 
 class Ring(NamedTuple):

@@ -45,7 +45,7 @@ def tune_command(
         if trial is None:
             continue
         say(
-            f"{name}: {trial.n_places} places, {trial.n_links} links, "
+            f"{name}: {trial.n_experiences} experiences, {trial.n_links} links, "
             f"inconsistency {shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
         )
     say(tuning.verdict)

@@ -1,4 +1,4 @@
-"""How hexagonal a rate map is: autocorrelogram, grid score, spacing and orientation."""
+"""Hexagonal symmetry of rate maps: autocorrelogram, grid score, spacing and orientation."""
 
 import math
 from functools import lru_cache
@@ -8,21 +8,22 @@ import numpy as np
 from scipy import fft, ndimage, sparse
 
 from neuroslam.errors import MapError
+from neuroslam.evaluation.ratemap import label_regions
 
 Unvisited = Literal["skip", "silent"]
 
 MIN_OVERLAP_BINS = 20
-"""Fewer overlapping bins say nothing: the autocorrelogram is NaN there."""
+"""Fewest overlapping bins for a correlation: the autocorrelogram is NaN below."""
 
 CENTRE_THRESHOLD = 0.2
 """Correlation at the edge of the central peak."""
 
 _REACH = 0.8  # rings end here, as a share of the map's shorter side: beyond, overlaps are small
-_MEAN_OF_RADII = 3  # one lucky radius must not make a grid
+_MEAN_OF_RADII = 3  # a high score at a single radius may be chance
 _ANGLES_DEG = (60, 120, 30, 90, 150)
 _MIN_SIDE_BINS = 10
 _MIN_VARIANCE = 1e-10  # of the map's own; below, an overlap is flat but for rounding
-_CELLS_AT_ONCE = 16  # what is worked on stays in the cache
+_CELLS_AT_ONCE = 16  # so many transforms fit into the processor's cache
 _MIN_APART_RAD = math.radians(30.0)  # two of the six inner peaks are never nearer in angle
 
 
@@ -40,8 +41,8 @@ def autocorrelogram(maps: np.ndarray, unvisited: Unvisited = "skip") -> np.ndarr
 
     Args:
         maps: ``(..., n_y, n_x)``; NaN where unvisited.
-        unvisited: ``skip`` leaves unvisited bins out, as the formula has it. ``silent`` takes
-            them for bins where the cell fires least, as opexebo and BNT do (there: at rate 0).
+        unvisited: ``skip`` leaves unvisited bins out, as the formula does. ``silent`` gives them
+            the map's lowest rate; opexebo and BNT give them rate 0.
 
     Returns:
         ``(..., 2 n_y - 1, 2 n_x - 1)``, zero shift in the middle, in [-1, 1]. NaN where fewer than
@@ -68,7 +69,7 @@ def autocorrelogram(maps: np.ndarray, unvisited: Unvisited = "skip") -> np.ndarr
 
 
 def gridness(maps: np.ndarray, unvisited: Unvisited = "silent") -> np.ndarray:
-    r"""Score how much more alike a map is to itself turned by 60 than turned by 30 degrees.
+    r"""Return the grid score: the map's similarity to itself at 60 degrees minus that at 30.
 
     .. math:: \mathrm{HGS} = \min(c_{60}, c_{120}) - \max(c_{30}, c_{90}, c_{150})
 
@@ -77,20 +78,21 @@ def gridness(maps: np.ndarray, unvisited: Unvisited = "silent") -> np.ndarray:
     (radius :math:`\lfloor\sqrt{A/\pi}\rfloor` bins of the region above
     :data:`CENTRE_THRESHOLD`) and ends at every whole radius up to 0.8 of the shorter side; the
     score is the largest mean over three consecutive ends. These are the rules of R. F. Langston et
-    al., Science 328, 2010, as opexebo and BNT (Kavli Institute, Trondheim) have them.
+    al., Science 328, 2010, as implemented in opexebo and BNT (Kavli Institute, Trondheim).
 
     The default ``silent`` follows those too, so that scores can be compared. In a round arena it
-    lies up to 0.2 from ``skip``, Eq. 13 to the letter, above or below. Noise scores higher with
+    differs by up to 0.2 from ``skip``, which is Eq. 13 to the letter. Noise scores higher with
     ``skip``, as the rim of the autocorrelogram then rests on few bins: of 200 maps of smoothed
-    noise one in twenty passed 0.56 in a circle and 0.60 in a triangle, against 0.15 and 0.51.
+    noise one in twenty exceeded 0.56 in a circle and 0.60 in a triangle, against 0.15 and 0.51.
 
     Args:
         maps: ``(..., n_y, n_x)``; NaN where unvisited.
         unvisited: As in :func:`autocorrelogram`.
 
     Returns:
-        ``(...,)`` in [-2, 2]: hexagons above 1, one field about 0, squares below. NaN where the
-        map is constant (it has no autocorrelogram), or the central peak leaves no room for rings.
+        ``(...,)`` in [-2, 2]: a hexagonal grid is above 1, a single field about 0, a square grid
+        below 0. NaN where the map is constant (it has no autocorrelogram), or the central peak
+        leaves no room for rings.
 
     Raises:
         MapError: As :func:`autocorrelogram`.
@@ -112,16 +114,16 @@ def gridness(maps: np.ndarray, unvisited: Unvisited = "silent") -> np.ndarray:
 
 
 class GridStats(NamedTuple):
-    """Size and lie of a grid; NaN, but for the diameter, if six inner peaks are not found.
+    """Spacing and orientation of a grid; all but the diameter are NaN without six inner peaks.
 
     Attributes:
         spacing_m: Mean distance of the six inner peaks of the autocorrelogram from its centre.
         orientation_rad: Their direction modulo 60 degrees, in (-pi/6, pi/6], counter-clockwise
             from the x axis.
         ellipticity: Longer over shorter axis of the ellipse through the six; 1 is a circle.
-        field_diameter_m: Diameter of the disc as large as the central peak of the autocorrelogram
-            above :data:`CENTRE_THRESHOLD`; wider than a firing field is.
-        peaks_m: The six, counter-clockwise from the first above the x axis, ``(6, 2)``.
+        field_diameter_m: Diameter of the disc with the area of the autocorrelogram's central peak
+            above :data:`CENTRE_THRESHOLD`; larger than that of a firing field.
+        peaks_m: The six peaks, counter-clockwise from the first above the x axis, ``(6, 2)``.
     """
 
     spacing_m: float
@@ -135,13 +137,13 @@ def grid_stats(rate_map: np.ndarray, bin_m: float, unvisited: Unvisited = "skip"
     """Measure a grid by the six inner peaks of its autocorrelogram.
 
     Peaks are the nearest maxima outside the central peak, at least 30 degrees apart in direction,
-    refined to parts of a bin by a parabola. Any map with three pairs of peaks has such numbers;
-    whether it is a grid says :func:`gridness`.
+    refined to a fraction of a bin by a parabola. Any map with three pairs of peaks has these
+    numbers; :func:`gridness` measures whether it is a grid.
 
     Args:
         rate_map: ``(n_y, n_x)``; NaN where unvisited.
         bin_m: Side of a bin.
-        unvisited: As in :func:`autocorrelogram`; ``silent`` draws the peaks towards the centre.
+        unvisited: As in :func:`autocorrelogram`; ``silent`` moves the peaks towards the centre.
 
     Raises:
         MapError: As :func:`autocorrelogram`, or if there is more than one map.
@@ -207,13 +209,16 @@ def _correlate(maps: np.ndarray, unvisited: Unvisited) -> np.ndarray:
     padded = tuple(fft.next_fast_len(n, real=True) for n in full)
     shift = tuple(n - 1 for n in maps.shape[1:])
 
+    def transform(values: np.ndarray) -> np.ndarray:
+        return np.asarray(fft.rfft2(values, padded))
+
     def over_shifts(product: np.ndarray) -> np.ndarray:
-        wrapped = fft.irfft2(product, padded, overwrite_x=True)
+        wrapped = np.asarray(fft.irfft2(product, padded, overwrite_x=True))
         return np.roll(wrapped, shift, axis=(1, 2))[:, : full[0], : full[1]]
 
-    of_mask = fft.rfft2(visited.astype(np.float64), padded)
-    of_map = fft.rfft2(standard, padded)
-    of_square = fft.rfft2(standard * standard, padded)
+    of_mask = transform(visited.astype(np.float64))
+    of_map = transform(standard)
+    of_square = transform(standard * standard)
     n = np.rint(over_shifts(of_mask * of_mask.conj()))
     # The sums over the shifted map are those over the map itself for the opposite shift.
     total = over_shifts(of_map * of_mask.conj())
@@ -227,9 +232,9 @@ def _correlate(maps: np.ndarray, unvisited: Unvisited) -> np.ndarray:
 
 
 def _standardise(maps: np.ndarray, visited: np.ndarray) -> np.ndarray:
-    """Mean 0 and deviation 1 over the visited bins, 0 elsewhere; a constant map is 0 throughout.
+    """Scale to mean 0 and deviation 1 over the visited bins, 0 elsewhere; a constant map gives 0.
 
-    Changes nothing in Eq. 13 but its rounding.
+    Eq. 13 does not depend on it, but its rounding errors do.
     """
     count = np.maximum(visited.sum(axis=(1, 2), keepdims=True), 1)
     largest = np.where(visited, np.abs(maps), 0.0).max(axis=(1, 2), keepdims=True)
@@ -242,11 +247,9 @@ def _standardise(maps: np.ndarray, visited: np.ndarray) -> np.ndarray:
 
 def _centre_area(r: np.ndarray) -> np.ndarray:
     """Bins in the central peak of ``(N, rows, columns)``; 0 where there is no autocorrelogram."""
-    within_a_map = np.zeros((3, 3, 3), dtype=bool)
-    within_a_map[1] = ndimage.generate_binary_structure(2, 1)
-    labels, _ = ndimage.label(r > CENTRE_THRESHOLD, within_a_map)  # NaN is not above
+    labels = label_regions(r > CENTRE_THRESHOLD)[0]  # NaN is not above
     centre = labels[:, r.shape[1] // 2, r.shape[2] // 2][:, None, None]
-    return ((labels == centre) & (centre > 0)).sum(axis=(1, 2))
+    return np.sum((labels == centre) & (centre > 0), axis=(1, 2))
 
 
 class _Rings(NamedTuple):
@@ -259,9 +262,9 @@ class _Rings(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _rings(rows: int, columns: int) -> _Rings:
-    """Bins at distance (k - 1, k] are of radius k = 1, 2, ...; one half is enough.
+    """Sort the bins by radius: those at a distance in (k - 1, k] have radius k = 1, 2, ....
 
-    The autocorrelogram looks the same turned by 180 degrees, so the other half adds nothing.
+    The autocorrelogram is symmetric under a turn of 180 degrees, so its upper half is enough.
     """
     y, x = np.mgrid[:rows, :columns]
     y, x = y - rows // 2, x - columns // 2
@@ -331,7 +334,7 @@ def _inner_pairs(r: np.ndarray, centre_radius: float) -> np.ndarray:
     """Up to three peaks ``(x, y)`` of the upper half, in bins; the other three lie opposite."""
     rows, columns = r.shape
     filled = np.where(np.isfinite(r), r, -np.inf)
-    # The middle of a firing field's image is no ripple: nothing higher within half its radius.
+    # A peak is the highest within half the radius of a field, so ripples within a field are none.
     size = 2 * max(1, round(centre_radius / 2)) + 1
     is_peak = (filled == ndimage.maximum_filter(filled, size)) & (filled > 0.0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
@@ -349,15 +352,15 @@ def _inner_pairs(r: np.ndarray, centre_radius: float) -> np.ndarray:
         patch = r[row[i] - 1 : row[i] + 2, column[i] - 1 : column[i] + 2]
         if min(apart, default=math.pi) < _MIN_APART_RAD or not np.isfinite(patch).all():
             continue
-        pairs.append(np.array([x[i], y[i]]) + _summit(patch))
+        pairs.append(np.array([x[i], y[i]]) + _vertex(patch))
         directions.append(direction)
         if len(pairs) == 3:
             break
     return np.array(pairs).reshape(-1, 2)
 
 
-def _summit(patch: np.ndarray) -> np.ndarray:
-    """Where the parabolas along x and y through a maximum's neighbours have their tops."""
+def _vertex(patch: np.ndarray) -> np.ndarray:
+    """Return the vertices of the parabolas in x and y through a maximum and its neighbours."""
     offset = []
     for before, at, after in (patch[1], patch[:, 1]):
         bend = before - 2.0 * at + after

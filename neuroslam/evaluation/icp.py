@@ -1,21 +1,21 @@
-"""How alike two maps are whose nodes are not paired: iterative closest points in the plane."""
+"""Difference of two maps whose points are not paired: iterative closest points in the plane."""
 
 import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import Alignment, align
 
 IcpMode = Literal["rigid", "similarity"]
 
-# Every source point on one target point has error 0: left free, the scale slides towards 0, and
-# even short of it a shrunken map fits better than an honest one. So it is bounded: to this factor
-# either way of the initial scale, or in map_rmse of the ratio of the two maps' RMS radii. For
-# fixed pairs the error is a parabola in the scale and the best rotation does not depend on it, so
-# the scale cut to the bound is the best one within it: the error still falls with every step.
+# A source shrunk onto one target point has error 0: an unbounded scale goes towards 0, and short
+# of it a shrunken map fits better than one of the right size. So the scale stays within this
+# factor of the initial scale, or in map_rmse of the ratio of the two maps' RMS radii. For fixed
+# pairs the error is a parabola in the scale and the best rotation does not depend on it, so the
+# scale clipped to the bound is the best one within it: the error still falls with every step.
 SCALE_FACTOR = 1.5
 
 _N_ROTATIONS = 24  # 15 degrees apart: no start is more than 7.5 degrees off
@@ -27,14 +27,14 @@ _Scales = tuple[float, float]
 
 
 class IcpResult(NamedTuple):
-    """How a source map lies best on a target map.
+    """The best alignment of a source map to a target map.
 
     Attributes:
-        alignment: Brings the source to the target.
-        rmse: Metres of the target, over all source points, each to its nearest target point.
-        n_iterations: Steps taken.
-        converged: Whether a step no longer lowered the error by more than the tolerance.
-        pairs: Index into the target of every source point's nearest, ``(n,)``.
+        alignment: Maps source points onto the target.
+        rmse: In metres of the target, over all source points, each to its nearest target point.
+        n_iterations: Steps of the optimisation.
+        converged: Whether the last step lowered the RMSE by no more than the tolerance.
+        pairs: Index of the target point nearest to every source point, ``(n,)``.
     """
 
     alignment: Alignment
@@ -52,27 +52,27 @@ def icp(
     max_iterations: int = 200,
     tolerance: float = 1e-10,
 ) -> IcpResult:
-    r"""Lay a map on another by pairing nearest points and aligning the pairs, in turn.
+    r"""Align a map to another by pairing nearest points and aligning the pairs, in turn.
 
     .. math:: \mathrm{RMSE}^2 = \min_{c, R, t} \frac1n \sum_i \min_j
               \lVert y_j - (c R x_i + t) \rVert^2
 
     Point to point, by P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE
-    PAMI 14(2), 1992. Every source point counts, however far. The minimum found is the one downhill
-    of the start; :func:`map_rmse` tries many starts.
+    PAMI 14(2), 1992. No pair is rejected, whatever its distance. The result is the local minimum
+    nearest to the start; :func:`map_rmse` tries many starts.
 
     Args:
         source_xy: Points :math:`x_i`, ``(n, 2)``, metres (of any size in mode ``similarity``).
         target_xy: Points :math:`y_j`, ``(m, 2)``, metres.
         mode: ``rigid`` keeps :math:`c = 1`; ``similarity`` finds it within a factor of
             :data:`SCALE_FACTOR` of the initial scale, so that the source cannot shrink to a point.
-        initial: Where to start; ``None`` is where the source lies.
+        initial: Alignment to start from; ``None`` is the identity.
         max_iterations: Steps at most; 0 only measures the start.
-        tolerance: A step that lowers the RMSE by no more, in metres, is the last.
+        tolerance: Stop after a step that lowers the RMSE by no more than this, in metres.
 
     Raises:
         MapError: If a shape is not ``(n, 2)``, a number is not finite, a map has fewer than two
-            distinct points, or the start is not one for the mode.
+            distinct points, or the initial alignment does not fit the mode.
 
     Example:
         >>> corner = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
@@ -87,24 +87,24 @@ def icp(
     _check_initial(initial, mode)
     scales = _scales_about(initial.scale)
     return _descend(
-        source, target, cKDTree(target), mode, initial, scales, max_iterations, tolerance
+        source, target, KDTree(target), mode, initial, scales, max_iterations, tolerance
     )
 
 
 def map_rmse(source_xy: np.ndarray, target_xy: np.ndarray, mode: IcpMode = "rigid") -> IcpResult:
-    """Compare two maps that may lie and be turned anyhow: the best :func:`icp` of many starts.
+    """Compare two maps of unknown relative pose: the best :func:`icp` of many starts.
 
-    The starts put centre on centre, principal axis on principal axis, and turn from there in steps
-    of 15 degrees. They go some steps with a part of the source, the best of them to the end with
-    all of it; so does where the source lies. The maps should cover the same place: one that covers
-    a part of the other needs :func:`icp` from a start that is about right. Along a lone path of
-    sparse nodes the search may stop a fraction of their spacing away from the best.
+    The starts align the centres and principal axes and turn from there in steps of 15 degrees.
+    Each makes some steps with a subset of the source; the best of them, and the identity, converge
+    with all of it. The maps should cover the same area: a map that covers a part of the other
+    needs :func:`icp` from a start near the solution. Along a single path of sparse points the
+    search may stop a fraction of their spacing away from the best.
 
     Args:
         source_xy: Points ``(n, 2)``, metres (of any size in mode ``similarity``).
         target_xy: Points ``(m, 2)``, metres.
         mode: As in :func:`icp`, but the scale stays within a factor of :data:`SCALE_FACTOR` of the
-            ratio of the RMS radii. If that admits 1, the RMSE is not above that of ``rigid``.
+            ratio of the RMS radii. If 1 is within it, the RMSE is not above that of ``rigid``.
 
     Raises:
         MapError: As :func:`icp`.
@@ -118,7 +118,7 @@ def map_rmse(source_xy: np.ndarray, target_xy: np.ndarray, mode: IcpMode = "rigi
     """
     source, target = _as_map("source", source_xy), _as_map("target", target_xy)
     _check_mode(mode)
-    tree = cKDTree(target)
+    tree = KDTree(target)
     ratio = _rms_radius(target) / _rms_radius(source) if mode == "similarity" else 1.0
     scales = _scales_about(ratio)
 
@@ -141,7 +141,7 @@ def fraction_of_diagonal(rmse: float, target_xy: np.ndarray) -> float:
     """Express an RMSE in metres as a fraction of the diagonal of the target's bounding box.
 
     Raises:
-        MapError: If the target is no map, as :func:`icp`.
+        MapError: If the target is not a valid map, as :func:`icp`.
 
     Example:
         >>> fraction_of_diagonal(0.5, np.array([[0.0, 0.0], [3.0, 4.0]]))
@@ -153,7 +153,7 @@ def fraction_of_diagonal(rmse: float, target_xy: np.ndarray) -> float:
 def _descend(
     source: np.ndarray,
     target: np.ndarray,
-    tree: cKDTree,
+    tree: KDTree,
     mode: IcpMode,
     alignment: Alignment,
     scales: _Scales,
@@ -172,8 +172,8 @@ def _descend(
     return IcpResult(alignment, rmse, n_iterations, converged, pairs)
 
 
-def _pair(tree: cKDTree, moved: np.ndarray) -> tuple[np.ndarray, float]:
-    distances, pairs = tree.query(moved)
+def _pair(tree: KDTree, moved: np.ndarray) -> tuple[np.ndarray, float]:
+    distances, pairs = map(np.asarray, tree.query(moved))
     return pairs, math.sqrt(float(np.mean(np.square(distances))))
 
 
@@ -182,7 +182,7 @@ def _align_pairs(
 ) -> Alignment:
     try:
         rotation, _, scale = align(source, paired, mode)
-    except MapError:  # all nearest to one point: every rotation is as good, so the last one stays
+    except MapError:  # all nearest to one point: any rotation fits equally, the last one stays
         rotation, _, scale = last
     if mode == "similarity":
         scale = min(max(scale, scales[0]), scales[1])
@@ -191,7 +191,7 @@ def _align_pairs(
 
 
 def _turned_starts(source: np.ndarray, target: np.ndarray, scale: float) -> list[Alignment]:
-    # From the principal axes on: they have no direction, and half a turn is in the grid.
+    # The principal axes have no direction, so the starts cover the full turn.
     first = _principal_angle(target) - _principal_angle(source)
     starts = []
     for angle in first + np.arange(_N_ROTATIONS) * (2.0 * math.pi / _N_ROTATIONS):
@@ -203,7 +203,7 @@ def _turned_starts(source: np.ndarray, target: np.ndarray, scale: float) -> list
 
 
 def _best_distinct(results: list[IcpResult]) -> list[IcpResult]:
-    # Many starts end in one valley; only its lowest is worth refining.
+    # Many starts converge to the same minimum; only the lowest of them is refined.
     kept: list[IcpResult] = []
     same = math.cos(math.pi / _N_ROTATIONS)  # closer than half a step of the grid
     for result in sorted(results, key=lambda result: result.rmse):
@@ -236,11 +236,11 @@ def _as_map(name: str, points: np.ndarray) -> np.ndarray:
     if not np.isfinite(points).all():
         at = int(np.argmin(np.isfinite(points).all(axis=1)))
         raise MapError(f"icp: point {at} of the {name} is not finite; leave it out")
-    # Relative to where the map lies, as in align: closer points than that are rounding.
+    # Relative to the coordinates, as in align: smaller differences are rounding.
     if not len(points) or np.ptp(points, axis=0).max() <= 1e-12 * np.abs(points).max():
         raise MapError(
-            f"icp: the {name} has {len(points)} point(s) and no 2 distinct ones; "
-            "2 are needed to fix a rotation"
+            f"icp: the {name} has {len(points)} point(s), all equal; expected at least 2 distinct "
+            "points, which fix a rotation"
         )
     return points
 
@@ -258,7 +258,7 @@ def _check_initial(initial: Alignment, mode: IcpMode) -> None:
             "expected (2, 2) and (2,)"
         )
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        raise MapError("icp: the initial alignment is not finite; leave it out to start unmoved")
+        raise MapError("icp: the initial alignment is not finite; give None to start unmoved")
     if not 0.0 < initial.scale < math.inf:
         raise MapError(f"icp: the initial scale is {initial.scale:g}, expected above 0")
     if mode == "rigid" and initial.scale != 1.0:

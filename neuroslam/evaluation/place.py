@@ -1,4 +1,4 @@
-"""How well places are recognised: precision, recall, average precision."""
+"""Quality of place recognition: precision, recall, average precision."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from neuroslam.errors import MapError
 
 
 class PrecisionRecall(NamedTuple):
-    """A curve over the threshold: one point for each distinct distance, nearest first.
+    """A precision-recall curve: one point for each distinct distance, smallest first.
 
     Attributes:
-        precision: Share of the answers within the threshold that are right.
-        recall: Share of all right answers that are within the threshold.
-        threshold: Distance up to which an answer is given.
+        precision: Share of the accepted matches that are correct.
+        recall: Share of all correct matches that are accepted.
+        threshold: Largest distance of an accepted match.
     """
 
     precision: np.ndarray
@@ -24,15 +24,15 @@ class PrecisionRecall(NamedTuple):
 def precision_recall(
     distances: np.ndarray, right: np.ndarray, n_right: int | None = None
 ) -> PrecisionRecall:
-    """Trace precision over recall while the threshold on a distance grows.
+    """Return precision and recall of matches for every threshold on their distance.
 
     Args:
-        distances: Distance of each answer; smaller is surer.
-        right: Whether it is right; same shape.
-        n_right: How many right answers there are to find, if more than those given.
+        distances: Distance of each match; a smaller one is more certain.
+        right: Whether the match is correct; same shape.
+        n_right: Number of correct matches that exist, if more than those in ``right``.
 
     Raises:
-        MapError: If there is nothing to find, or the shapes differ.
+        MapError: If no correct match exists, or the shapes differ.
 
     Example:
         >>> curve = precision_recall(np.array([1.0, 2.0, 3.0]), np.array([True, False, True]))
@@ -47,16 +47,19 @@ def precision_recall(
         )
     n_right = int(right.sum()) if n_right is None else n_right
     if n_right < 1:
-        raise MapError("precision_recall: no right answer to find; recall has no meaning")
+        raise MapError(
+            f"precision_recall: {n_right} correct matches exist, expected at least one; "
+            "recall is not defined without"
+        )
     order = np.argsort(distances, kind="stable")
     distances, hits = distances[order], np.cumsum(right[order])
-    last = np.append(np.diff(distances) > 0, True)  # equally near answers are given together
-    answers = np.arange(1, len(distances) + 1)[last]
-    return PrecisionRecall(hits[last] / answers, hits[last] / n_right, distances[last])
+    last = np.append(np.diff(distances) > 0, True)  # matches of equal distance go together
+    accepted = np.arange(1, len(distances) + 1)[last]
+    return PrecisionRecall(hits[last] / accepted, hits[last] / n_right, distances[last])
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    r"""Sum precision over the steps of recall.
+    r"""Return the average precision: the sum of precision over the steps of recall.
 
     .. math:: AP = \sum_n (R_n - R_{n-1}) \, P_n
 
@@ -69,7 +72,7 @@ def average_precision(curve: PrecisionRecall) -> float:
 
 
 def recall_at_full_precision(curve: PrecisionRecall) -> float:
-    """Return the largest recall that is reached without one wrong answer.
+    """Return the largest recall without a false match.
 
     Example:
         >>> curve = precision_recall(np.array([1.0, 2.0, 3.0]), np.array([True, False, True]))

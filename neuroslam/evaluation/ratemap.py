@@ -1,4 +1,4 @@
-"""Where cells fire: occupancy, rate maps, firing fields, and how much a map tells of the place."""
+"""Rate maps of cells: occupancy, firing rate, firing fields and spatial information."""
 
 from typing import NamedTuple, Self
 
@@ -69,33 +69,34 @@ class Bins(NamedTuple):
         x_max = self.x_min_m + self.n_x * self.bin_m
         return self.x_min_m, x_max, self.y_min_m, self.y_min_m + self.n_y * self.bin_m
 
-    def index(self, positions: np.ndarray) -> np.ndarray:
+    def flat_index(self, positions: np.ndarray) -> np.ndarray:
         """Return the flat index of the bin of every position, -1 outside (NaN is outside).
 
         The upper edges belong to the last bins.
 
         Example:
-            >>> Bins(0.0, 0.0, 2, 2, 0.5).index([[0.1, 0.1], [1.0, 0.7], [1.1, 0.0]]).tolist()
+            >>> bins = Bins(0.0, 0.0, 2, 2, 0.5)
+            >>> bins.flat_index([[0.1, 0.1], [1.0, 0.7], [1.1, 0.0]]).tolist()
             [0, 3, -1]
         """
         at = (_as_points("Bins", positions) - (self.x_min_m, self.y_min_m)) / self.bin_m
         size = np.array([self.n_x, self.n_y])
-        inside = ((at >= -_ROUNDING_BINS) & (at <= size + _ROUNDING_BINS)).all(axis=1)
+        inside = np.all((at >= -_ROUNDING_BINS) & (at <= size + _ROUNDING_BINS), axis=1)
         column, row = np.clip(np.where(inside[:, None], at, 0.0).astype(np.int64), 0, size - 1).T
         return np.where(inside, row * self.n_x + column, -1)
 
 
 class RateMaps:
-    """Sums of activity and counts of samples in every bin, fed in pieces; the maps follow.
+    """Accumulator of rate maps: sums of activity and counts of samples in every bin.
 
     Sums and counts are kept, not their quotient, so two recordings add up (``first + second``) to
-    what one long one would have given. The pieces should be sampled alike.
+    the maps of one long recording. All parts should have the same sampling rate.
 
     Attributes:
         bins: The bins.
         sums: Activity summed, ``(N, n_y, n_x)``.
         counts: Samples, ``(n_y, n_x)``.
-        n_outside: Samples that lay in no bin and were left out.
+        n_outside: Samples that were in no bin and were left out.
 
     Example:
         >>> maps = RateMaps(Bins(0.0, 0.0, 2, 1, 0.5), n_cells=1)
@@ -132,20 +133,20 @@ class RateMaps:
         if not np.isfinite(activity).all():
             cell = int(np.flatnonzero(~np.isfinite(activity).all(axis=0))[0])
             raise MapError(f"RateMaps: activity of cell {cell} is not finite; leave such cells out")
-        index = self.bins.index(positions)
-        seen = np.flatnonzero(index >= 0)
+        index = self.bins.flat_index(positions)
+        inside = np.flatnonzero(index >= 0)
         n_bins = self.counts.size
-        place = sparse.csr_array(
-            (np.ones(len(seen)), (index[seen], seen)), shape=(n_bins, len(index))
+        membership = sparse.csr_array(
+            (np.ones(len(inside)), (index[inside], inside)), shape=(n_bins, len(index))
         )
-        self.sums = self.sums + (place @ activity).T.reshape(self.sums.shape)
-        self.counts = self.counts + np.bincount(index[seen], minlength=n_bins).reshape(
+        self.sums = self.sums + (membership @ activity).T.reshape(self.sums.shape)
+        self.counts = self.counts + np.bincount(index[inside], minlength=n_bins).reshape(
             self.counts.shape
         )
-        self.n_outside += len(index) - len(seen)
+        self.n_outside += len(index) - len(inside)
 
     def __add__(self, other: Self) -> Self:
-        """Return the two together; their bins and cells must be the same."""
+        """Return the sum of two recordings of the same cells over the same bins."""
         if self.bins != other.bins or len(self.sums) != len(other.sums):
             raise MapError(
                 f"RateMaps: cannot add {len(other.sums)} cell(s) over {other.bins} to "
@@ -161,8 +162,8 @@ class RateMaps:
 
         .. math:: \lambda(x) = \frac{\sum_{x'} G(x - x') \, S(x')}{\sum_{x'} G(x - x') \, T(x')}
 
-        Sums :math:`S` and counts :math:`T` are smoothed alike, so an unvisited bin has no weight
-        and a constant activity gives a constant map up to the edge.
+        Sums :math:`S` and counts :math:`T` are smoothed by the same kernel, so an unvisited bin has
+        no weight and a constant activity gives a constant map up to the edge.
 
         Args:
             sigma_bins: Standard deviation of the Gaussian :math:`G`; 0 does not smooth.
@@ -185,7 +186,7 @@ def rate_map(
     sigma_bins: float = 1.5,
     min_occupancy_samples: float = 1.0,
 ) -> np.ndarray:
-    """Return the smoothed rate maps ``(N, n_y, n_x)`` of whole arrays; see :class:`RateMaps`.
+    """Return the smoothed rate maps ``(N, n_y, n_x)`` of one recording; see :class:`RateMaps`.
 
     Args:
         positions: ``(T, 2)``, metres.
@@ -218,8 +219,8 @@ def spike_map(
 ) -> np.ndarray:
     """Return the rate map of a recorded cell in Hz, ``(n_y, n_x)``; see :class:`RateMaps`.
 
-    A spike lies where the sample nearest in time lies; a spike before the first or after the last
-    sample is left out. A sample stands for the median interval.
+    A spike gets the position of the sample nearest in time; spikes before the first or after the
+    last sample are left out. Every sample lasts the median interval.
 
     Args:
         positions: ``(T, 2)``, metres.
@@ -248,19 +249,20 @@ def spike_map(
     spikes = spikes[(spikes >= times[0] - interval / 2) & (spikes <= times[-1] + interval / 2)]
     nearest = np.searchsorted((times[:-1] + times[1:]) / 2, spikes)
     per_sample = np.bincount(nearest, minlength=len(times)) / interval
-    return rate_map(positions, per_sample, bins, sigma_bins, min_occupancy_samples)[0]
+    (of_cell,) = rate_map(positions, per_sample, bins, sigma_bins, min_occupancy_samples)
+    return of_cell
 
 
 class Fields(NamedTuple):
     """The firing fields of every cell.
 
     Attributes:
-        count: How many there are, ``(N,)``.
-        area_m2: Area of the largest, ``(N,)``; NaN where there is none.
+        n_fields: Number of fields, ``(N,)``.
+        area_m2: Area of the largest field, ``(N,)``; NaN without a field.
         diameter_m: Diameter of the disc of that area, ``(N,)``.
     """
 
-    count: np.ndarray
+    n_fields: np.ndarray
     area_m2: np.ndarray
     diameter_m: np.ndarray
 
@@ -276,7 +278,7 @@ def fields(
         maps: ``(N, n_y, n_x)``, or one ``(n_y, n_x)``; NaN where unvisited.
         bin_m: Side of a bin.
         threshold: Share of the peak.
-        min_area_m2: A smaller region is none; the default is about three bins of 2.5 cm.
+        min_area_m2: Smallest field; the default is about three bins of 2.5 cm.
 
     Raises:
         MapError: If the maps have another number of dimensions.
@@ -284,16 +286,14 @@ def fields(
     Example:
         >>> two = np.array([[9.0, 9.0, 0.0, 5.0], [9.0, 9.0, 0.0, np.nan]])
         >>> found = fields(two, bin_m=0.1)
-        >>> found.count.tolist(), found.area_m2.round(3).tolist()
+        >>> found.n_fields.tolist(), found.area_m2.round(3).tolist()
         ([2], [0.04])
     """
     maps = _as_maps("fields", maps)
     filled = np.where(np.isfinite(maps), maps, -np.inf)
     peak = np.maximum(filled.max(axis=(1, 2), keepdims=True), 0.0)
     above = (filled > threshold * peak) & (peak > 0.0)
-    within_a_map = np.zeros((3, 3, 3), dtype=bool)
-    within_a_map[1] = ndimage.generate_binary_structure(2, 1)
-    labels, n = ndimage.label(above, within_a_map)
+    labels, n = label_regions(above)
     area = np.bincount(labels.ravel(), minlength=n + 1)[1:] * bin_m**2
     cell = ndimage.maximum(np.arange(len(maps))[:, None, None], labels, np.arange(1, n + 1))
     cell = np.asarray(cell, dtype=np.int64)  # a region lies within one map
@@ -305,10 +305,30 @@ def fields(
     return Fields(count, largest, 2.0 * np.sqrt(largest / np.pi))
 
 
+def label_regions(above: np.ndarray) -> tuple[np.ndarray, int]:
+    """Number the connected regions of each map of a stack; bins that touch by a side connect.
+
+    Args:
+        above: Bins of the regions, ``(N, n_y, n_x)``.
+
+    Returns:
+        Number of each bin's region, 0 outside; and how many regions all maps have.
+
+    Example:
+        >>> label_regions(np.array([[[True, False, True]], [[True, True, False]]]))
+        (array([[[1, 0, 2]], [[3, 3, 0]]], dtype=int32), 3)
+    """
+    within_a_map = np.zeros((3, 3, 3), dtype=bool)
+    within_a_map[1] = ndimage.generate_binary_structure(2, 1)
+    labels = np.zeros(above.shape, np.int32)
+    ndimage.label(above, within_a_map, output=labels)
+    return labels, int(labels.max(initial=0))
+
+
 def responding(activity: np.ndarray, threshold: float = 0.5) -> np.ndarray:
     """Count the cells that fire above a share of the strongest at that instant, ``(T,)``.
 
-    Where no cell is active the count is 0.
+    The count is 0 while no cell is active.
 
     Args:
         activity: ``(T, N)``.
@@ -325,11 +345,11 @@ def responding(activity: np.ndarray, threshold: float = 0.5) -> np.ndarray:
     if activity.ndim != 2 or activity.shape[1] == 0:
         raise MapError(f"responding: activity has shape {activity.shape}, expected (T, N)")
     strongest = activity.max(axis=1, keepdims=True)
-    return ((activity > threshold * strongest) & (strongest > 0.0)).sum(axis=1)
+    return np.sum((activity > threshold * strongest) & (strongest > 0.0), axis=1)
 
 
 def coverage(maps: np.ndarray, inside: np.ndarray | None = None) -> np.ndarray:
-    """Return the share of bins that were visited, for every map.
+    """Return the visited share of the bins, for every map.
 
     Args:
         maps: ``(..., n_y, n_x)``; NaN where unvisited.
@@ -349,18 +369,18 @@ def coverage(maps: np.ndarray, inside: np.ndarray | None = None) -> np.ndarray:
             f"coverage: inside has shape {inside.shape} and {int(inside.sum())} bin(s), expected "
             f"{visited.shape[-2:]} and at least one"
         )
-    return (visited & inside).sum(axis=(-2, -1)) / inside.sum()
+    return np.asarray(np.sum(visited & inside, axis=(-2, -1)) / inside.sum())
 
 
 def spatial_information(maps: np.ndarray, occupancy: np.ndarray) -> np.ndarray:
-    r"""Return how many bits one spike tells of the place, ``(N,)``.
+    r"""Return the spatial information of each cell in bits per spike, ``(N,)``.
 
     .. math:: I = \sum_x p(x) \frac{\lambda(x)}{\bar\lambda} \log_2 \frac{\lambda(x)}{\bar\lambda},
               \qquad \bar\lambda = \sum_x p(x) \lambda(x)
 
     By W. E. Skaggs, B. L. McNaughton, K. M. Gothard and E. J. Markus, "An information-theoretic
     approach to deciphering the hippocampal code", NIPS 5, 1993. Times :math:`\bar\lambda` it is
-    bits per second. Short recordings give too much, smoothing too little.
+    bits per second. A short recording biases it upwards, smoothing downwards.
 
     Args:
         maps: Rates, ``(N, n_y, n_x)`` or one ``(n_y, n_x)``, not negative; NaN where unvisited.

@@ -1,4 +1,4 @@
-"""How far a track is from the truth: alignment, absolute and relative error, shape; TUM files."""
+"""Error of a track against the truth: alignment, ATE, RPE, shape; TUM trajectory files."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ AlignmentMode = Literal["none", "rigid", "similarity"]
 
 
 class Alignment(NamedTuple):
-    """A similarity: ``point -> scale * rotation @ point + translation``.
+    """A similarity transform: ``point -> scale * rotation @ point + translation``.
 
     Attributes:
         rotation: Proper rotation, ``(d, d)``.
@@ -27,16 +27,16 @@ class Alignment(NamedTuple):
     scale: float
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Move points ``(n, d)`` of the estimate to where the truth has them."""
-        return self.scale * points @ self.rotation.T + self.translation
+        """Transform points ``(n, d)`` from the frame of the estimate to that of the truth."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
     def undo(self, points: np.ndarray) -> np.ndarray:
-        """Move points ``(n, d)`` of the truth to where the estimate has them."""
-        return (points - self.translation) @ self.rotation / self.scale
+        """Transform points ``(n, d)`` from the frame of the truth to that of the estimate."""
+        return np.asarray((points - self.translation) @ self.rotation / self.scale)
 
 
 class ErrorStatistics(NamedTuple):
-    """Size of ``n`` errors, in the unit of the errors."""
+    """Statistics of ``n`` errors, in the unit of the errors."""
 
     rmse: float
     mean: float
@@ -60,7 +60,7 @@ class Track(NamedTuple):
 
 
 def align(estimate: np.ndarray, truth: np.ndarray, mode: AlignmentMode = "rigid") -> Alignment:
-    r"""Find the motion that brings a track closest to the truth, in the least-squares sense.
+    r"""Find the transform of a track with the least squared distance to the truth.
 
     .. math:: \min_{c, R, t} \frac1n \sum_i \lVert y_i - (c R x_i + t) \rVert^2
 
@@ -70,11 +70,12 @@ def align(estimate: np.ndarray, truth: np.ndarray, mode: AlignmentMode = "rigid"
     Args:
         estimate: Points :math:`x_i`, ``(n, d)`` with d 2 or 3, metres.
         truth: Points :math:`y_i` at the same instants, same shape.
-        mode: ``none`` changes nothing, ``rigid`` keeps :math:`c = 1`, ``similarity`` finds it too.
+        mode: ``none`` is the identity, ``rigid`` keeps :math:`c = 1`, ``similarity`` finds the
+            scale too.
 
     Raises:
         MapError: If shapes differ, a number is not finite, or the points do not fix a rotation
-            (fewer than two distinct ones in the plane).
+            (fewer than two distinct points in the plane).
 
     Example:
         >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -113,15 +114,15 @@ def align(estimate: np.ndarray, truth: np.ndarray, mode: AlignmentMode = "rigid"
 def absolute_trajectory_error(
     estimate: np.ndarray, truth: np.ndarray, mode: AlignmentMode = "rigid"
 ) -> ErrorStatistics:
-    r"""Measure the distances :math:`\lVert y_i - (c R x_i + t) \rVert` left after :func:`align`.
+    r"""Return statistics of :math:`\lVert y_i - (c R x_i + t) \rVert` after :func:`align`.
 
     Args:
         estimate: Positions ``(n, d)``, metres.
         truth: Positions at the same instants, same shape.
-        mode: What may be aligned first.
+        mode: Alignment before the error is measured.
 
     Returns:
-        RMSE, mean, median and maximum, in metres.
+        RMSE, mean, median and maximum in metres, and the number of points.
 
     Raises:
         MapError: As :func:`align`.
@@ -139,13 +140,13 @@ def absolute_trajectory_error(
 def relative_pose_error(
     estimate: np.ndarray, truth: np.ndarray, delta: int = 1
 ) -> RelativePoseError:
-    r"""Compare the motions over ``delta`` frames, from every frame :math:`i` on.
+    r"""Compare the displacements over ``delta`` frames, starting at every frame :math:`i`.
 
     .. math:: E_i = \ominus (\ominus q_i \oplus q_{i+\Delta})
               \oplus (\ominus p_i \oplus p_{i+\Delta})
 
-    Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. The size of
-    :math:`E_i` does not depend on where the two tracks start, so nothing is aligned.
+    Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. The magnitude
+    of :math:`E_i` does not depend on where the two tracks start, so there is no alignment.
 
     Args:
         estimate: Poses :math:`p`, ``(n, 3)``: x, y in metres, heading in radians.
@@ -168,8 +169,8 @@ def relative_pose_error(
             f"relative error: delta is {delta} frames, expected 1 to {len(estimate) - 1} "
             f"for {len(estimate)} poses"
         )
-    moved, should = (_relative(poses[:-delta], poses[delta:]) for poses in (estimate, truth))
-    error = _relative(should, moved)
+    estimated, true = (_relative(poses[:-delta], poses[delta:]) for poses in (estimate, truth))
+    error = _relative(true, estimated)
     return RelativePoseError(
         _statistics(np.hypot(error[:, 0], error[:, 1])), _statistics(np.abs(error[:, 2]))
     )
@@ -178,18 +179,18 @@ def relative_pose_error(
 def associate(
     first_s: np.ndarray, second_s: np.ndarray, max_difference_s: float = 0.02
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pair the instants of two tracks that are nearest to each other; each is used at most once.
+    """Pair the times of two tracks that are nearest to each other; each is used at most once.
 
     Args:
         first_s: Rising times, ``(n,)``.
         second_s: Rising times, ``(m,)``.
-        max_difference_s: Farther apart than this is no pair.
+        max_difference_s: Largest difference of a pair.
 
     Returns:
-        Indices into the first and into the second, of equal length, rising; empty if none pair up.
+        Indices into the first and into the second, of equal length, rising; empty without a pair.
 
     Raises:
-        MapError: If times do not rise.
+        MapError: If times decrease.
 
     Example:
         >>> [i.tolist() for i in associate([0.0, 1.0, 2.0], [1.01, 2.5], 0.1)]
@@ -199,7 +200,10 @@ def associate(
     for name, times in (("first", first_s), ("second", second_s)):
         if (np.diff(times) < 0).any():
             at = int(np.argmax(np.diff(times) < 0)) + 1
-            raise MapError(f"associate: times of the {name} track step back at entry {at}; sort it")
+            raise MapError(
+                f"associate: times of the {name} track decrease at index {at}, from "
+                f"{times[at - 1]:.3f} s to {times[at]:.3f} s; sort them first"
+            )
     if not (len(first_s) and len(second_s)):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     there, back = _nearest(first_s, second_s), _nearest(second_s, first_s)
@@ -209,7 +213,7 @@ def associate(
 
 
 def path_length(points: np.ndarray) -> float:
-    """Add up the steps of a track ``(n, d)``, in its unit; 0 for fewer than two points.
+    """Return the length of a track ``(n, d)``, in its unit; 0 for fewer than two points.
 
     Example:
         >>> path_length(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 5.0]]))
@@ -219,7 +223,7 @@ def path_length(points: np.ndarray) -> float:
 
 
 def shape_rmse(a_xy: np.ndarray, b_xy: np.ndarray) -> float:
-    """Compare two drawings of one track: RMSE after a similarity alignment of ``a`` to ``b``.
+    """Compare the shapes of two tracks: RMSE after a similarity alignment of ``a`` to ``b``.
 
     Args:
         a_xy: Positions ``(n, 2)``, any unit.
@@ -240,7 +244,7 @@ def shape_rmse(a_xy: np.ndarray, b_xy: np.ndarray) -> float:
 
 
 def write_tum(path: Path, track: Track) -> None:
-    """Write a track as TUM lines ``time x y z qx qy qz qw``, to a nanosecond and a nanometre."""
+    """Write a track as TUM lines ``time x y z qx qy qz qw``: times to 1 ns, positions to 1 nm."""
     half = np.asarray(track.poses)[:, 2] / 2.0
     lines = [
         f"{time:.9f} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n"
@@ -252,10 +256,10 @@ def write_tum(path: Path, track: Track) -> None:
 
 
 def read_tum(path: Path) -> Track:
-    """Read TUM lines ``time x y z qx qy qz qw``; height, roll and pitch are left out.
+    """Read TUM lines ``time x y z qx qy qz qw``; height, roll and pitch are ignored.
 
     Raises:
-        SourceError: If the file is missing or a line is not of that kind; the line is named.
+        SourceError: If the file is missing or a line is invalid; the message has its number.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -274,7 +278,9 @@ def read_tum(path: Path) -> Track:
                 "expected 'time x y z qx qy qz qw', times rising"
             )
     if not rows:
-        raise SourceError(f"trajectory {path}: no pose in it; expected 'time x y z qx qy qz qw'")
+        raise SourceError(
+            f"trajectory {path}: has no pose; expected lines 'time x y z qx qy qz qw'"
+        )
     t, x, y, _, qx, qy, qz, qw = np.array(rows).T
     norm = qx**2 + qy**2 + qz**2 + qw**2
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy**2 + qz**2))
@@ -282,7 +288,7 @@ def read_tum(path: Path) -> Track:
 
 
 def _tum_fault(line: str, rows: list[list[float]]) -> str:
-    # Adds the line's numbers to the rows, or says what is wrong with them.
+    # Appends the line's numbers to the rows, or returns what is wrong with them.
     words = line.split()
     try:
         row = [float(word) for word in words]
@@ -295,7 +301,7 @@ def _tum_fault(line: str, rows: list[list[float]]) -> str:
     if not any(row[4:]):
         return "got a quaternion of length 0"
     if rows and row[0] <= rows[-1][0]:
-        return f"time {words[0]} does not come after {rows[-1][0]:.9f}"
+        return f"time {words[0]} is not above the time before, {rows[-1][0]:.9f}"
     rows.append(row)
     return ""
 

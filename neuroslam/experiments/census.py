@@ -75,7 +75,7 @@ class Gatherer:
         self.total = [old + new for old, new in zip(self.total, self.recent, strict=True)]
         maps = np.stack([one.maps() for one in self.total])
         last = np.stack([one.maps() for one in self.recent]) if self.census else maps
-        n_fields = np.stack([fields(one, self.bins.bin_m).count for one in maps])
+        n_fields = np.stack([fields(one, self.bins.bin_m).n_fields for one in maps])
         silent, skip = gridness(maps, "silent"), gridness(maps, "skip")
         scores = silent, skip, gridness(last, "silent") if self.census else silent, n_fields
         time_s = self.times_s[len(self.census)]

@@ -42,17 +42,14 @@ from neuroslam.experiments.place_lives import (
     TrackResult,
     run_track,
 )
+from neuroslam.figures.place_errors import Spread, plot_errors, plot_growth, plot_sweep
 from neuroslam.figures.places import (
-    PathTold,
+    EstimatedPath,
     PlaceMap,
     Response,
-    Spread,
-    plot_errors,
-    plot_growth,
     plot_paths,
     plot_place_maps,
     plot_responses,
-    plot_sweep,
 )
 from neuroslam.figures.style import save
 from neuroslam.runs.parallel import parallel_map
@@ -280,8 +277,8 @@ def draw_track(result: TrackResult, out: Path) -> None:
     ).numpy()
     last = slrb.minutes >= slrb.minutes[-1] * (1.0 - _PATH_SHARE)
     paths = [
-        PathTold(SLRB, slrb.estimate_m[0, last], feet + truth[0]),
-        PathTold(PATH, full[PATH].estimate_m[0, last]),
+        EstimatedPath(SLRB, slrb.estimate_m[0, last], feet + truth[0]),
+        EstimatedPath(PATH, full[PATH].estimate_m[0, last]),
     ]
     span = f"{slrb.minutes[last][0]:.3g} to {times[1]}"
     title = f"Believed and true path on the {name} track, {span}, first seed"

@@ -15,7 +15,7 @@ from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.experiments.animals import WALLS, live_with, path_integration, read_track
-from neuroslam.figures.places import Spread
+from neuroslam.figures.place_errors import Spread
 from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.types import Motion
 from neuroslam.worlds.rodent import Walk

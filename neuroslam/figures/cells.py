@@ -1,15 +1,18 @@
-"""Figures of animals in arenas: walls, boundary cells, firing maps of grid cells, their scores.
+"""Figures of animals in arenas: walls, boundary cells, rate maps of grid cells, their scores.
 
 Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.style.save` writes it.
 """
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -30,23 +33,23 @@ from neuroslam.figures.style import (
 from neuroslam.worlds.arena import Arena
 
 ZONES = {"inhibition": "#f2f2f2", "attenuation": "#fbe3b0", "growth": "#b9e2d2"}
-"""Zones of the activity of boundary cells, from far to near, and their colours."""
+"""Zone of distances to a wall, from far to near -> colour."""
 _CORRELATION = "RdBu_r"
 
 
 class Approach(NamedTuple):
-    """A way towards a wall or away from it, and what boundary cells made of it.
+    """A path towards a wall or away from it, and the activity of boundary cells along it.
 
     Attributes:
-        title: What the way is.
-        arena: Where it is.
+        title: Description of the path.
+        arena: Arena of the path.
         path_m: Positions, ``(t, 2)``.
         time_s: ``(t,)``.
-        distance_m: To the nearest wall, ``(t,)``.
+        distance_m: Distance to the nearest wall, ``(t,)``.
         zone: Number of the zone in :data:`ZONES`, ``(t,)``.
-        activity: In [0, 1], ``(t,)``.
-        active: Share of all cells that fire, ``(t,)``.
-        rates: Strongest rate of the cells of each preferred bearing, ``(t, n_bearings)``.
+        activity: Activity of all cells, in [0, 1], ``(t,)``.
+        active: Share of the cells that fire, ``(t,)``.
+        rates: Highest rate of the cells of each preferred bearing, ``(t, n_bearings)``.
     """
 
     title: str
@@ -61,16 +64,16 @@ class Approach(NamedTuple):
 
 
 class Firing(NamedTuple):
-    """Where a cell fires.
+    """The rate map of a cell.
 
     Attributes:
-        title: Which cell it is.
-        note: What is known of it, such as its score.
+        title: The cell.
+        note: A note at the right of the title, such as its grid score.
         rate_map: ``(n_y, n_x)``; NaN where unvisited.
-        bins: Of the map.
-        arena: Walls around.
-        track_m: Where the animal went, ``(t, 2)``, or nothing.
-        places_m: Where it was when the cell fired, ``(n, 2)``.
+        bins: Bins of the map.
+        arena: The arena.
+        track_m: Path of the animal, ``(t, 2)``, or empty.
+        places_m: Positions of the animal when the cell fired, ``(n, 2)``.
     """
 
     title: str
@@ -83,7 +86,7 @@ class Firing(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A quantity over time; ``spread`` is drawn as a band to either side, where there is one."""
+    """A quantity over time; ``spread``, if given, is drawn as a band to either side."""
 
     x: np.ndarray
     y: np.ndarray
@@ -93,7 +96,7 @@ class Curve(NamedTuple):
 
 
 def draw_arena(axes: Axes, arena: Arena) -> None:
-    """Draw the outline of an arena, with equal axes in metres around it."""
+    """Draw the outline of an arena, with equal axes in metres."""
     for line in arena.outlines:
         axes.plot(*line.T, color=INK, lw=1.4, zorder=4, solid_joinstyle="miter")
     x_min, x_max, y_min, y_max = arena.bounds
@@ -108,7 +111,7 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
 
 
 def draw_rate_map(axes: Axes, rate_map: np.ndarray, bins: Bins, arena: Arena) -> None:
-    """Draw a firing map, 0 to its own peak; white is unvisited."""
+    """Draw a rate map from 0 to its own peak; unvisited bins are white."""
     top = float(np.nanmax(rate_map)) if np.isfinite(rate_map).any() else 0.0
     axes.imshow(rate_map, ACTIVITY, origin="lower", extent=bins.extent_m, vmin=0.0, vmax=top or 1.0)
     draw_arena(axes, arena)
@@ -116,7 +119,7 @@ def draw_rate_map(axes: Axes, rate_map: np.ndarray, bins: Bins, arena: Arena) ->
 
 
 def draw_autocorrelogram(axes: Axes, rate_map: np.ndarray, bin_m: float) -> None:
-    """Draw how a firing map correlates with itself shifted; white is too little overlap."""
+    """Draw the autocorrelogram of a rate map; shifts with too little overlap are white."""
     r = autocorrelogram(rate_map)
     y, x = (bin_m * n / 2.0 for n in r.shape)
     axes.imshow(r, _CORRELATION, origin="lower", extent=(-x, x, -y, y), vmin=-1.0, vmax=1.0)
@@ -125,22 +128,27 @@ def draw_autocorrelogram(axes: Axes, rate_map: np.ndarray, bin_m: float) -> None
 
 
 def plot_approaches(approaches: Sequence[Approach], title: str) -> Figure:
-    """Draw ways towards walls and away from them, two in a row, with the cells' response.
+    """Draw paths towards walls and away from them, two in a row, with the boundary cells.
 
-    Each has its way seen from above; over time its distance to the nearest wall, the activity, and
-    the rates by preferred bearing. Zones are shaded.
+    Each has its path seen from above, and over time its distance to the nearest wall, the activity,
+    and the rates by preferred bearing. Zones are shaded.
+
+    Args:
+        approaches: Paths and the activity along them.
+        title: Title of the whole figure.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no path.
     """
     _need("plot_approaches", approaches)
     rows = -(-len(approaches) // 2)
     with mpl.rc_context(STYLE):
         figure = new_figure(13.0, 3.9 * rows + 0.5, title)
-        parts = np.atleast_2d(figure.subfigures(rows, 2, wspace=0.03, hspace=0.03)).ravel()
+        parts = figure.subfigures(rows, 2, wspace=0.03, hspace=0.03, squeeze=False).ravel()
         for part, approach in zip(parts, approaches, strict=False):
             _draw_approach(part, approach)
-        key = [Patch(fc=colour, ec="#999999", label=zone) for zone, colour in ZONES.items()]
+        key: list[Artist] = []
+        key += [Patch(fc=colour, ec="#999999", label=zone) for zone, colour in ZONES.items()]
         key += [Line2D([], [], color=INK, lw=1.6, label="distance to the nearest wall")]
         key += [Line2D([], [], color=MAP, lw=1.8, label="activity of all cells")]
         key += [Line2D([], [], color=LOOP, lw=1.3, ls="--", label="share of the cells that fire")]
@@ -150,26 +158,26 @@ def plot_approaches(approaches: Sequence[Approach], title: str) -> Figure:
 
 def _draw_approach(part: SubFigure, approach: Approach) -> None:
     axes = part.subplot_mosaic(
-        [["way", "distance"], ["way", "activity"], ["way", "rates"]],
+        [["path", "distance"], ["path", "activity"], ["path", "rates"]],
         width_ratios=[1.0, 1.5],
         height_ratios=[1.0, 1.0, 1.3],
     )
     time = approach.time_s
-    draw_arena(axes["way"], approach.arena)
-    axes["way"].annotate(
+    draw_arena(axes["path"], approach.arena)
+    axes["path"].annotate(
         "",
         approach.path_m[-1],
         approach.path_m[0],
         arrowprops={"arrowstyle": "-|>", "color": LOOP, "lw": 2.0, "shrinkA": 0, "shrinkB": 0},
     )
-    start = {"ls": "none", "marker": "o", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.2}
-    axes["way"].plot(*approach.path_m[0], zorder=7, **start)
+    start: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 6, "mfc": "white"}
+    axes["path"].plot(*approach.path_m[0], zorder=7, mec=INK, mew=1.2, **start)
     write_title(axes["distance"], approach.title)
     axes["distance"].plot(time, approach.distance_m, color=INK, lw=1.6)
     axes["distance"].set(ylabel="distance (m)", ylim=(0.0, 1.05 * approach.distance_m.max()))
     axes["activity"].plot(time, approach.activity, color=MAP, lw=1.8)
     axes["activity"].plot(time, approach.active, color=LOOP, lw=1.3, ls="--")
-    axes["activity"].set(ylabel="activity", ylim=(0.0, 0.8))
+    axes["activity"].set(ylabel="activity\nor share", ylim=(0.0, 0.8))
     edges = np.flatnonzero(np.diff(approach.zone)) + 1
     borders = [0, *edges.tolist(), len(time) - 1]
     colours = list(ZONES.values())
@@ -179,7 +187,7 @@ def _draw_approach(part: SubFigure, approach: Approach) -> None:
         ax.set_xlim(time[0], time[-1])
         ax.tick_params(labelbottom=False)
     n = approach.rates.shape[1]
-    # From -180 degrees on, so that a wall straight ahead is in the middle.
+    # From -180 degrees, so that a wall straight ahead is in the middle.
     picture = axes["rates"].imshow(
         np.roll(approach.rates, n // 2, axis=1).T,
         ACTIVITY,
@@ -192,20 +200,20 @@ def _draw_approach(part: SubFigure, approach: Approach) -> None:
     axes["rates"].set(xlabel="time (s)", ylabel="preferred\nbearing (°)", yticks=(-90, 0, 90))
     axes["rates"].grid(visible=False)
     bar = part.colorbar(picture, ax=axes["rates"], pad=0.02, ticks=(0, 0.5, 1))
-    bar.set_label("rate")
+    bar.set_label("rate (1 at most)")
     bar.outline.set_visible(False)
 
 
 def plot_firing_maps(rows: Sequence[Sequence[Firing]], title: str, unit: str) -> Figure:
-    """Draw firing maps in rows, all with one scale of rates.
+    """Draw rate maps in rows, all with one colour scale.
 
     Args:
-        rows: Of one arena each, as many in each.
-        title: Heading of the whole figure.
-        unit: Of the rates, for the colour bar.
+        rows: Rows of equal length, each of one arena.
+        title: Title of the whole figure.
+        unit: Quantity and unit of the rates, for the colour bar.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no map.
     """
     _need("plot_firing_maps", rows)
     top = max(float(np.nanmax(cell.rate_map)) for row in rows for cell in row) or 1.0
@@ -225,10 +233,14 @@ def plot_firing_maps(rows: Sequence[Sequence[Firing]], title: str, unit: str) ->
 
 
 def plot_firing(cells: Sequence[Firing], title: str) -> Figure:
-    """Draw cells side by side: where each fired on the track, its map, its autocorrelogram.
+    """Draw cells side by side: firing on the track, rate map, autocorrelogram.
+
+    Args:
+        cells: The cells.
+        title: Title of the whole figure.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no cell.
     """
     _need("plot_firing", cells)
     with mpl.rc_context(STYLE):
@@ -242,25 +254,25 @@ def plot_firing(cells: Sequence[Firing], title: str) -> Figure:
             write_title(places, cell.title)
             draw_rate_map(rates, cell.rate_map, cell.bins, cell.arena)
             draw_autocorrelogram(shifted, cell.rate_map, cell.bins.bin_m)
-            write_title(rates, "Firing map")
+            write_title(rates, "Rate map")
             write_title(shifted, "Autocorrelogram", cell.note)
         _bars(figure, axes[1:2], axes[2:3])
         key = [Line2D([], [], color=ODOMETRY, lw=1.2, label="track")]
-        dot = {"ls": "none", "marker": "o", "ms": 4, "mew": 0, "color": LOOP}
-        key.append(Line2D([], [], label="the cell fires", **dot))
+        dot: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 4, "mew": 0, "color": LOOP}
+        key.append(Line2D([], [], label="positions where the cell fires", **dot))
         figure.legend(handles=key, loc="outside lower center", ncols=2)
     return figure
 
 
 def plot_grids(rows: Mapping[str, Sequence[Firing]], title: str) -> Figure:
-    """Draw firing maps, each beside its autocorrelogram, a row for each method.
+    """Draw rate maps, each beside its autocorrelogram, a row for each method.
 
     Args:
-        rows: Method -> cells at some times.
-        title: Heading of the whole figure.
+        rows: Method -> a cell at some times.
+        title: Title of the whole figure.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no row.
     """
     _need("plot_grids", rows)
     n = max(map(len, rows.values()))
@@ -294,14 +306,14 @@ def plot_encounters(
     arena: Arena,
     title: str,
 ) -> Figure:
-    """Draw where boundary cells were active by some times, a panel for each.
+    """Draw the positions where boundary cells were active up to some times, a panel for each.
 
     Args:
-        positions_m: Where the animal was, ``(t, 2)``.
-        activity: Of its boundary cells, ``(t,)``.
-        stops: What a panel is headed with -> the step up to which it shows.
-        arena: Where.
-        title: Heading of the whole figure.
+        positions_m: Positions of the animal, ``(t, 2)``.
+        activity: Activity of its boundary cells, ``(t,)``.
+        stops: Title of a panel -> the step up to which it shows.
+        arena: The arena.
+        title: Title of the whole figure.
 
     Raises:
         ValueError: If there is no time.
@@ -309,17 +321,18 @@ def plot_encounters(
     _need("plot_encounters", stops)
     with mpl.rc_context(STYLE):
         figure, axes = _panels(len(stops), 5, (2.5, 2.75), (0.9, 0.5), title)
+        style: dict[str, Any] = {"s": 3.0, "lw": 0, "cmap": ACTIVITY, "vmin": 0.0, "vmax": 1.0}
         for (name, stop), ax in zip(stops.items(), axes.ravel(), strict=False):
-            where, active = positions_m[:stop], activity[:stop] > 0.0
-            ax.plot(*where.T, color="#d5d5d5", lw=0.4, zorder=1)
-            style = {"s": 3.0, "lw": 0, "cmap": ACTIVITY, "vmin": 0.0, "vmax": 1.0, "zorder": 2}
-            drawn = ax.scatter(*where[active].T, c=activity[:stop][active], **style)
+            path, active = positions_m[:stop], activity[:stop] > 0.0
+            ax.plot(*path.T, color="#d5d5d5", lw=0.4, zorder=1)
+            ax.scatter(*path[active].T, c=activity[:stop][active], zorder=2, **style)
             draw_arena(ax, arena)
             ax.grid(visible=False)
             write_title(ax, *name.split("|"))
         _tidy(axes)
-        bar = figure.colorbar(drawn, ax=axes, shrink=0.5, pad=0.01)
-        bar.set_label("activity of boundary cells")
+        colours = ScalarMappable(Normalize(0.0, 1.0), ACTIVITY)
+        bar = figure.colorbar(colours, ax=axes, shrink=0.5, pad=0.01)
+        bar.set_label("activity of boundary cells (1 at most)")
         bar.outline.set_visible(False)
     return figure
 
@@ -328,9 +341,9 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
     """Draw grid scores over time, a panel for each arena or spacing; one legend for all.
 
     Args:
-        panels: What a panel is headed with -> name -> curve.
-        time_label: What the horizontal axis is, with its unit.
-        title: Heading of the whole figure.
+        panels: Title of a panel -> name -> curve.
+        time_label: Label of the horizontal axis, with its unit.
+        title: Title of the whole figure.
 
     Raises:
         ValueError: If there is no panel.
@@ -338,10 +351,11 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
     _need("plot_scores", panels)
     with mpl.rc_context(STYLE):
         figure, axes = _panels(len(panels), 3, (3.7, 3.1), (0.4, 0.9), title, share=True)
-        key = {}
+        key: dict[str, Line2D] = {}
+        style: dict[str, Any] = {"lw": 1.7, "marker": "o", "ms": 3.5}
         for (name, curves), ax in zip(panels.items(), axes.ravel(), strict=False):
             for label, (x, y, colour, dash, spread) in curves.items():
-                style = {"color": colour, "ls": dash, "lw": 1.7, "marker": "o", "ms": 3.5}
+                style |= {"color": colour, "ls": dash}
                 key[label] = ax.plot(x, y, label=label, **style)[0]
                 if spread is not None:
                     ax.fill_between(x, y - spread, y + spread, color=colour, alpha=0.15, lw=0)
@@ -350,7 +364,7 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
             ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 3, 5, 6, 10]))
             write_title(ax, name)
         for ax in axes[:, 0]:
-            ax.set_ylabel("grid score (2 at most)")
+            ax.set_ylabel("grid score (-2 to 2)")
         columns = len(key) if len(key) < 6 else 4
         figure.legend(handles=list(key.values()), loc="outside lower center", ncols=columns)
     return figure
@@ -364,7 +378,7 @@ def _panels(
     title: str,
     share: bool = False,
 ) -> tuple[Figure, np.ndarray]:
-    """Make a figure with ``n`` panels in rows; the places left over in the last row stay empty."""
+    """Make a figure with ``n`` panels in rows; the rest of the last row stays empty."""
     columns = min(most_columns, n)
     lines = -(-n // columns)
     width, height = panel_in[0] * columns + around_in[0], panel_in[1] * lines + around_in[1]
@@ -376,7 +390,7 @@ def _panels(
 
 
 def _tidy(axes: np.ndarray) -> None:
-    """Write what the axes are at the left and at the bottom alone."""
+    """Label the axes at the left and at the bottom only."""
     for ax in axes[:-1].ravel():
         ax.set_xlabel("")
     for ax in axes[:, 1:].ravel():
@@ -384,12 +398,12 @@ def _tidy(axes: np.ndarray) -> None:
 
 
 def _bars(figure: Figure, maps: np.ndarray, shifted: np.ndarray) -> None:
-    """Put colour bars at the right: one for the maps, one for the autocorrelograms."""
-    rates = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, 1.0), ACTIVITY)
-    correlation = mpl.cm.ScalarMappable(mpl.colors.Normalize(-1.0, 1.0), _CORRELATION)
+    """Put colour bars at the right: one for the rate maps, one for the autocorrelograms."""
+    rates = ScalarMappable(Normalize(0.0, 1.0), ACTIVITY)
+    correlation = ScalarMappable(Normalize(-1.0, 1.0), _CORRELATION)
     shrink = 0.8 if maps is not shifted else 0.35
     for scale, axes, label in (
-        (rates, maps, "share of the map's peak"),
+        (rates, maps, "rate / peak rate of the map"),
         (correlation, shifted, "correlation"),
     ):
         bar = figure.colorbar(scale, ax=axes, shrink=shrink, pad=0.012, aspect=18)
@@ -397,6 +411,6 @@ def _bars(figure: Figure, maps: np.ndarray, shifted: np.ndarray) -> None:
         bar.outline.set_visible(False)
 
 
-def _need(who: str, things: Sequence | Mapping) -> None:
-    if not len(things):
-        raise ValueError(f"{who}: got nothing to draw, expected at least one")
+def _need(function: str, parts: Sequence[object] | Mapping[str, object]) -> None:
+    if not len(parts):
+        raise ValueError(f"{function}: got nothing to draw, expected at least one part")

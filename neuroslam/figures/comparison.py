@@ -1,10 +1,11 @@
-"""Figures of methods side by side: their errors and costs, and what a lost sense does to them."""
+"""Figures of methods side by side: their errors and costs, and their errors without a sensor."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -24,15 +25,15 @@ _LEAST_M = 0.01
 
 
 def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw errors of methods, a panel for each world, and what each costs.
+    """Draw the errors of methods, a panel for each world, and their CPU time.
 
     Args:
-        rows: Of :func:`neuroslam.experiments.compare.compare`.
+        rows: Rows of :func:`neuroslam.experiments.compare.compare`.
     """
     worlds = list(dict.fromkeys(row["world"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))[::-1]
     with mpl.rc_context(STYLE):
-        title = "All methods on the same drives: the full brain beside its parts"
+        title = "Accuracy of all methods on the same drives: the full brain and its parts"
         figure = new_figure(4.2 * (len(worlds) + 1), 0.42 * len(methods) + 1.8, title)
         axes = figure.subplots(1, len(worlds) + 1, sharey=True)
         for ax, world in zip(axes, worlds, strict=False):
@@ -52,7 +53,7 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                     textcoords="offset points", va="center", fontsize=8,
                 )  # fmt: skip
             _logarithmic(ax)
-            ax.set_xlabel("absolute trajectory error (m)")
+            ax.set_xlabel("ATE, rigid alignment (m, RMSE)")
             ax.set_title(world)
         cost = axes[-1]
         for k, method in enumerate(methods):
@@ -64,15 +65,15 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                     textcoords="offset points", va="center", fontsize=8,
                 )  # fmt: skip
         _logarithmic(cost)
-        cost.set_xlabel("CPU time of a frame (ms)")
-        cost.set_title("cost")
+        cost.set_xlabel("CPU time per frame (ms)")
+        cost.set_title("CPU time")
         axes[0].set_yticks(range(len(methods)), methods)
         figure.supxlabel("bars: mean over drives; circles: each drive", fontsize=8)
     return figure
 
 
-def _logarithmic(ax: mpl.axes.Axes) -> None:
-    """Write few and plain numbers on a logarithmic axis, and leave room for labels of bars."""
+def _logarithmic(ax: Axes) -> None:
+    """Make the axis logarithmic with few, plain numbers, and leave room for labels of bars."""
     ax.set_xscale("log")
     low, high = ax.get_xlim()
     ax.set_xlim(low / 1.2, high * 1.7)
@@ -86,15 +87,15 @@ def plot_losses(
     options: Mapping[str, str],
     frame_rate_hz: float = 10.0,
 ) -> Figure:
-    """Draw the error over time, a panel for each sense that is lost for a while.
+    """Draw the error over time, a panel for each sensor that fails for a while.
 
     Args:
-        curves: Error (m) of each frame, by what is lost and by method.
-        options: Options of the world for each, of which the times are shaded.
-        frame_rate_hz: Frames a second.
+        curves: Error (m) of each frame, by sensor and by method.
+        options: Options of the world for each sensor; their times are shaded.
+        frame_rate_hz: Frame rate.
     """
     with mpl.rc_context(STYLE):
-        title = "A sense is lost for a while: error on the final map, laid over the truth"
+        title = "Failure of a sensor: error on the final map after rigid alignment to the truth"
         figure = new_figure(9.0, 1.75 * len(curves) + 1.0, title)
         axes = figure.subplots(len(curves), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for ax, (loss, each) in zip(axes, curves.items(), strict=True):
@@ -115,8 +116,8 @@ def plot_losses(
     return figure
 
 
-def _shade(ax: mpl.axes.Axes, option: str) -> None:
-    """Mark the time at which a sense is lost, or the robot kidnapped."""
+def _shade(ax: Axes, option: str) -> None:
+    """Mark the time during which a sensor fails, or when the robot is kidnapped."""
     _, _, when = option.partition("=")
     if ":" in when:
         ax.axvline(float(when.split(":")[0]), color=INK, lw=1.0, ls="--", zorder=1)

@@ -1,6 +1,6 @@
 """Figures of head-direction and speed cells: tuning, the bump over time, drift, rates.
 
-Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.plotting.save` writes it.
+Plain arrays in, a matplotlib ``Figure`` out; :func:`neuroslam.figures.style.save` writes it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,20 +10,21 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from neuroslam.figures.style import ACTIVITY, CURVES, INK, LOOP, MAP, STYLE, new_figure, write_title
 
 
 class Bump(NamedTuple):
-    """Activity of a ring over time, and headings beside it.
+    """Activity of a ring over time, and headings to compare with.
 
     Attributes:
-        title: What is seen.
+        title: Title of the panel.
         time_s: ``(t,)``.
-        rates: ``(t, n)``, cells evenly over the full turn.
-        decoded_deg: Heading that the ring tells, ``(t,)``.
+        rates: Rates of the cells, spaced evenly over the full turn, ``(t, n)``.
+        decoded_deg: Heading decoded from the ring, ``(t,)``.
         other_deg: The true heading, or that of a cue, ``(t,)``.
-        other: Which of them it is.
+        other: Label of ``other_deg``.
     """
 
     title: str
@@ -35,14 +36,14 @@ class Bump(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """Errors of several animals over time, and what theory expects of their spread.
+    """Heading errors of several animals over time, and the expected standard deviation.
 
     Attributes:
-        title: What holds the heading.
+        title: The cue that corrects the heading.
         time_s: ``(t,)``.
         error_deg: ``(t, animals)``.
-        expected_deg: Standard deviation expected, ``(t,)``, or nothing.
-        expected: What it is of.
+        expected_deg: Expected standard deviation, ``(t,)``, or ``None``.
+        expected: Label of ``expected_deg``.
     """
 
     title: str
@@ -55,24 +56,23 @@ class Drift(NamedTuple):
 def plot_tuning(
     heading_deg: np.ndarray, rates: Mapping[str, np.ndarray], widths_deg: Mapping[str, float]
 ) -> Figure:
-    """Draw tuning curves of some cells, and one of them with its widths.
+    """Draw tuning curves of some cells, and the widths of one of them.
 
     Args:
         heading_deg: ``(t,)``, rising.
-        rates: Name of a cell -> its rate at each heading.
-        widths_deg: What a width is of -> width of the last cell, in the order of the levels
-            50 % and 2 % of the peak.
+        rates: Preferred direction of a cell -> its rate at each heading.
+        widths_deg: Label of a width -> width of the last cell, at 50 % and at 2 % of the peak.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(9.0, 3.4, "Tuning of head-direction cells")
+        figure = new_figure(9.0, 3.4, "Tuning curves of head-direction cells")
         all_cells, one = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
         for (name, curve), colour in zip(rates.items(), CURVES, strict=False):
             all_cells.plot(heading_deg, curve, color=colour, lw=1.8, label=name)
-        all_cells.set(xlabel="heading (°)", ylabel="rate (1 at the peak)", xlim=(0, 360))
+        all_cells.set(xlabel="heading (°)", ylabel="firing rate / peak rate", xlim=(0, 360))
         all_cells.set_xticks(range(0, 361, 60))
         all_cells.set_ylim(0.0, 1.08)
-        write_title(all_cells, "Cells that prefer")
-        all_cells.legend(loc="upper right", fontsize=8, ncols=1)
+        write_title(all_cells, "Five cells")
+        all_cells.legend(loc="upper right", fontsize=8, ncols=1, title="preferred direction")
         curve = list(rates.values())[-1]
         middle = heading_deg[int(curve.argmax())]
         away = (heading_deg - middle + 180.0) % 360.0 - 180.0
@@ -86,29 +86,29 @@ def plot_tuning(
             widths_deg.items(), (0.5, 0.02), (LOOP, CURVES[2]), strict=True
         ):
             one.plot([-width / 2, width / 2], [level, level], color=colour, lw=2.2, label=name)
-        one.set(xlabel="heading away from preferred (°)", ylabel="rate", xlim=(-110, 110))
+        one.set(xlabel="heading minus preferred direction (°)", xlim=(-110, 110))
+        one.set_ylabel("firing rate / peak rate")
         one.set_xticks(range(-90, 91, 45))
         one.set(ylim=(0.0, 1.42), yticks=(0.0, 0.5, 1.0))
-        write_title(one, "Width")
+        write_title(one, "Tuning width")
         one.legend(loc="upper center", fontsize=8)
     return figure
 
 
 def plot_bumps(bumps: Sequence[Bump], title: str) -> Figure:
-    """Draw the activity of rings over time, one above the other, with headings over it."""
+    """Draw the activity of rings over time, one above the other, and headings over it."""
     with mpl.rc_context(STYLE):
         figure = new_figure(9.0, 2.6 * len(bumps) + 0.5, title)
         rows = np.atleast_1d(figure.subplots(len(bumps), 1))
-        for bump, axes in zip(bumps, rows, strict=True):
-            picture = _draw_bump(axes, bump)
+        pictures = [_draw_bump(axes, bump) for bump, axes in zip(bumps, rows, strict=True)]
         rows[-1].set_xlabel("time (s)")
-        bar = figure.colorbar(picture, ax=rows.tolist(), pad=0.01, ticks=(0, 0.5, 1))
-        bar.set_label("rate (1 at the peak)")
+        bar = figure.colorbar(pictures[-1], ax=rows.tolist(), pad=0.01, ticks=(0, 0.5, 1))
+        bar.set_label("firing rate / peak rate")
         bar.outline.set_visible(False)
     return figure
 
 
-def _draw_bump(axes: Axes, bump: Bump) -> mpl.image.AxesImage:
+def _draw_bump(axes: Axes, bump: Bump) -> AxesImage:
     n = bump.rates.shape[1]
     half = 180.0 / n
     picture = axes.imshow(
@@ -143,7 +143,7 @@ def _cut_at_jumps(heading_deg: np.ndarray) -> np.ndarray:
 
 
 def plot_drifts(drifts: Sequence[Drift], title: str) -> Figure:
-    """Draw errors of animals over time, a panel for each way the heading is held."""
+    """Draw heading errors of animals over time, a panel for each kind of cue."""
     with mpl.rc_context(STYLE):
         figure = new_figure(3.5 * len(drifts), 3.3, title)
         for drift, axes in zip(
@@ -179,26 +179,26 @@ def plot_drifts(drifts: Sequence[Drift], title: str) -> Figure:
                     label="± sd of the animals" if sign > 0 else None,
                 )
             top = 1.6 * np.abs(drift.error_deg).max()
-            axes.set(xlabel="time (min)", ylabel="error of the heading (°)", ylim=(-top, top))
+            axes.set(xlabel="time (min)", ylabel="heading error (°)", ylim=(-top, top))
             write_title(axes, drift.title)
             axes.legend(loc="upper left", fontsize=7.5)
     return figure
 
 
 def plot_persistence(time_s: np.ndarray, moved_deg: np.ndarray, width_deg: np.ndarray) -> Figure:
-    """Draw how far bumps moved without input, ``(t, bumps)``, and how wide one was, ``(t,)``."""
+    """Draw the drift of bumps without input, ``(t, bumps)``, and the width of one, ``(t,)``."""
     with mpl.rc_context(STYLE):
-        figure = new_figure(8.0, 3.0, "A bump without input")
+        figure = new_figure(8.0, 3.0, "Persistence of a bump without input")
         left, right = figure.subplots(1, 2)
         for k, moved in enumerate(moved_deg.T):
             left.plot(time_s / 60.0, 1e9 * moved, color=CURVES[k % len(CURVES)], lw=1.5)
-        left.set(xlabel="time (min)", ylabel="moved ($10^{-9}$ °)")
-        write_title(left, "Where it is", f"{moved_deg.shape[1]} bumps, on and between cells")
+        left.set(xlabel="time (min)", ylabel="displacement ($10^{-9}$ °)")
+        write_title(left, "Drift", f"{moved_deg.shape[1]} bumps, on and between cells")
         right.plot(time_s / 60.0, width_deg, color=MAP, lw=1.8)
         middle = float(width_deg[-1])
         right.set(xlabel="time (min)", ylabel="width at half height (°)")
         right.set_ylim(middle - 1.0, middle + 1.0)
-        write_title(right, "How wide it is")
+        write_title(right, "Width")
     return figure
 
 
@@ -207,34 +207,36 @@ def plot_speed_cells(
     rates_hz: np.ndarray,
     run_m_s: np.ndarray,
     noisy_hz: np.ndarray,
-    told_m_s: np.ndarray,
+    decoded_m_s: np.ndarray,
     scores: np.ndarray,
 ) -> Figure:
-    """Draw rates of speed cells against speed, rates of one while running, and the speed told.
+    """Draw tuning of speed cells, noisy rates of one of them, and the speed decoded from all.
 
     Args:
-        speed_m_s: Steady speeds, ``(k,)``.
+        speed_m_s: Constant speeds, ``(k,)``.
         rates_hz: Rates at them, ``(k, n)``.
-        run_m_s: Speeds of a run, ``(t,)``.
-        noisy_hz: Rates of one cell then, ``(t,)``.
-        told_m_s: Speed read from all, ``(t,)``.
+        run_m_s: Changing speeds of a run, ``(t,)``.
+        noisy_hz: Rates of one cell in that run, ``(t,)``.
+        decoded_m_s: Speed decoded from all cells, ``(t,)``.
         scores: Speed score of every cell in the run, ``(n,)``.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(10.5, 3.3, "Speed cells")
-        steady, one, told = figure.subplots(1, 3)
+        figure = new_figure(10.5, 3.3, "Tuning of speed cells, and the speed decoded from them")
+        steady, one, decoded = figure.subplots(1, 3)
         for k, rates in enumerate(rates_hz.T):
             steady.plot(speed_m_s, rates, color=CURVES[k % len(CURVES)], lw=1.0)
-        steady.set(xlabel="running speed (m/s)", ylabel="rate (Hz)", xlim=(0, speed_m_s[-1]))
+        steady.set(xlabel="running speed (m/s)", ylabel="firing rate (Hz)", xlim=(0, speed_m_s[-1]))
         steady.set_ylim(bottom=0.0)
         write_title(steady, "Tuning", f"{rates_hz.shape[1]} cells")
         one.plot(run_m_s, noisy_hz, ".", color=MAP, ms=2.0, alpha=0.5)
-        one.set(xlabel="running speed (m/s)", ylabel="rate (Hz)")
-        write_title(one, "One cell, noisy", f"scores {scores.min():.2f} to {scores.max():.2f}")
-        told.plot(run_m_s, told_m_s, ".", color=MAP, ms=2.0, alpha=0.5, label="read from all cells")
-        ends = [0.0, 1.05 * float(max(run_m_s.max(), told_m_s.max()))]
-        told.plot(ends, ends, color=INK, lw=1.2, ls="--", label="equal")
-        told.set(xlabel="running speed (m/s)", ylabel="speed told (m/s)", xlim=ends, ylim=ends)
-        write_title(told, "Read-out")
-        told.legend(loc="upper left", fontsize=8)
+        one.set(xlabel="running speed (m/s)", ylabel="firing rate (Hz)")
+        span = f"speed scores {scores.min():.2f} to {scores.max():.2f}"
+        write_title(one, "A noisy cell", span)
+        ends = (0.0, 1.05 * float(max(run_m_s.max(), decoded_m_s.max())))
+        decoded.plot(run_m_s, decoded_m_s, ".", color=MAP, ms=2.0, alpha=0.5, label="all cells")
+        decoded.plot(ends, ends, color=INK, lw=1.2, ls="--", label="equal")
+        decoded.set(xlabel="running speed (m/s)", ylabel="decoded speed (m/s)")
+        decoded.set(xlim=ends, ylim=ends)
+        write_title(decoded, "Decoding")
+        decoded.legend(loc="upper left", fontsize=8)
     return figure

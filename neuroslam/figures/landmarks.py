@@ -1,7 +1,7 @@
-"""Figures of semantic maps: what is where, what is there, and how far it is."""
+"""Figures of semantic maps: queries for landmarks and areas, vectors to landmarks, beliefs."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -36,12 +36,12 @@ _SIMILARITY = "RdBu_r"
 
 
 class Query(NamedTuple):
-    """What a map answers to a question for places.
+    """The answer of a map to a query for landmarks.
 
     Attributes:
-        title: The question.
-        similarity: With each place, ``(n_y, n_x)``.
-        targets: Names of the landmarks that are meant.
+        title: The query.
+        similarity: Similarity of the answer with each position, ``(n_y, n_x)``.
+        targets: Names of the landmarks that the query describes.
     """
 
     title: str
@@ -49,8 +49,8 @@ class Query(NamedTuple):
     targets: Sequence[str]
 
 
-def look_of(landmark: Landmark) -> dict[str, object]:
-    """Return colour and marker of a landmark, as its words say them."""
+def style_of(landmark: Landmark) -> dict[str, Any]:
+    """Return colour and marker of a landmark, from the words of its pointer."""
     words = landmark.pointer.replace("*", " ").replace("+", " ").upper().split()
     colour = next((_COLOURS[w] for w in words if w in _COLOURS), INK)
     return {"marker": next((_MARKERS[w] for w in words if w in _MARKERS), "X"), "color": colour}
@@ -59,38 +59,41 @@ def look_of(landmark: Landmark) -> dict[str, object]:
 def draw_landmarks(
     axes: Axes, world: LandmarkWorld, only: Sequence[str] | None = None, size: float = 8.0
 ) -> None:
-    """Draw points in their colours and shapes, and walls as areas.
+    """Draw point landmarks in their colours and shapes, and walls as areas.
 
     Args:
-        axes: In metres.
-        world: All of them.
-        only: Names of those that are drawn; ``None``: all.
-        size: Of the markers.
+        axes: Axes in metres.
+        world: World of the landmarks.
+        only: Names of the landmarks to draw; ``None``: all.
+        size: Size of the markers.
     """
     for landmark in world.landmarks:
         if only is not None and landmark.name not in only:
             continue
         if landmark.is_point:
-            style = {"ls": "none", "ms": size, "mec": "white", "mew": 0.9, "zorder": 6}
-            axes.plot(*landmark.position_m[:2], **style, **look_of(landmark))
+            style: dict[str, Any] = {"ls": "none", "ms": size, "mec": "white", "mew": 0.9}
+            axes.plot(*landmark.position_m[:2], zorder=6, **style, **style_of(landmark))
         else:
             for low, high in landmark.boxes_m:
-                box = Rectangle(low, *(high - low), fc=WALL, ec="#666666", lw=0.8, zorder=3)
-                axes.add_patch(box)
+                axes.add_patch(_box(low, high, fc=WALL, ec="#666666", lw=0.8, zorder=3))
+
+
+def _box(low: np.ndarray, high: np.ndarray, **style: Any) -> Rectangle:  # noqa: ANN401 - matplotlib's
+    width, height = np.asarray(high) - low
+    return Rectangle((low[0], low[1]), width, height, **style)
 
 
 def draw_world(axes: Axes, world: LandmarkWorld, path_m: np.ndarray | None = None) -> None:
-    """Draw a world from above: landmarks, from where each is seen, and a path."""
+    """Draw a world from above: landmarks, the areas from which they are visible, and a path."""
     if path_m is not None:
         axes.plot(*path_m.T, color=INK, lw=0.7, zorder=2)
     for landmark in world.landmarks:
         if landmark.is_point:
-            axes.add_patch(
-                Circle(landmark.position_m, world.view_radius_m, fc="#ececec", ec="none", zorder=1)
-            )
+            x, y = landmark.position_m
+            axes.add_patch(Circle((x, y), world.view_radius_m, fc="#ececec", ec="none", zorder=1))
             axes.annotate(
                 landmark.name.replace("_", " ").lower(),
-                landmark.position_m,
+                (x, y),
                 (0, -11),
                 textcoords="offset points",
                 ha="center",
@@ -103,7 +106,7 @@ def draw_world(axes: Axes, world: LandmarkWorld, path_m: np.ndarray | None = Non
 
 
 def draw_query(axes: Axes, world: LandmarkWorld, query: Query, most: float) -> None:
-    """Draw similarities as a heat map, and rings around the places that are meant."""
+    """Draw similarities as a heat map, and rings around the landmarks of the query."""
     (x0, x1), (y0, y1) = world.bounds_m
     axes.imshow(
         query.similarity,
@@ -117,11 +120,11 @@ def draw_query(axes: Axes, world: LandmarkWorld, query: Query, most: float) -> N
     for name in query.targets:
         landmark = world.named(name)
         if landmark.is_point:
-            ring = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "mew": 1.2}
-            axes.plot(*landmark.position_m, zorder=6, **ring)
+            ring: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none"}
+            axes.plot(*landmark.position_m, zorder=6, mec=INK, mew=1.2, **ring)
         else:
             for low, high in landmark.boxes_m:
-                axes.add_patch(Rectangle(low, *(high - low), fill=False, ec=INK, lw=1.1, zorder=6))
+                axes.add_patch(_box(low, high, fill=False, ec=INK, lw=1.1, zorder=6))
     _metric(axes, world)
     axes.grid(visible=False)
     write_title(axes, query.title)
@@ -130,13 +133,13 @@ def draw_query(axes: Axes, world: LandmarkWorld, query: Query, most: float) -> N
 def plot_queries(
     world: LandmarkWorld, path_m: np.ndarray | None, queries: Sequence[Query], title: str
 ) -> Figure:
-    """Draw a world and what its map answers (the paper's Figs. 1 and 4).
+    """Draw a world and the answers of its map to queries (the paper's Figs. 1 and 4).
 
     Args:
-        world: In the plane.
-        path_m: Of the animal, ``(t, 2)``, or ``None``.
-        queries: All with one scale.
-        title: Heading of the whole figure.
+        world: A world in the plane.
+        path_m: Path of the animal, ``(t, 2)``, or ``None``.
+        queries: Queries and answers, drawn with one colour scale.
+        title: Title of the whole figure.
     """
     n = len(queries) + 1
     columns = min(3, n)
@@ -146,14 +149,14 @@ def plot_queries(
         figure = new_figure(3.5 * columns + 0.7, 3.55 * rows + 0.5, title)
         axes = figure.subplots(rows, columns, squeeze=False)
         draw_world(axes[0, 0], world, path_m)
-        seen_from = "grey: from where a landmark is seen" if world.view_radius_m > 0 else ""
+        seen_from = "grey: area in which a landmark is visible" if world.view_radius_m > 0 else ""
         write_title(axes[0, 0], "World", seen_from)
         for query, ax in zip(queries, axes.ravel()[1:], strict=False):
             draw_query(ax, world, query, most)
         for ax in axes.ravel()[n:]:
             ax.set_visible(False)
         bar = figure.colorbar(axes.ravel()[1].images[0], ax=axes, shrink=0.6, pad=0.01)
-        bar.set_label("similarity with each place; rings: what was asked for")
+        bar.set_label("similarity with each position; rings: landmarks of the query")
         bar.outline.set_visible(False)
     return figure
 
@@ -172,15 +175,15 @@ def plot_vectors(
     """Draw the vectors to all landmarks and their errors over time (the paper's Fig. 5).
 
     Args:
-        world: In the plane.
-        position_m: Of the animal at the end.
-        estimates_m: Name -> where the map has it.
+        world: A world in the plane.
+        position_m: Position of the animal at the end.
+        estimates_m: Name of a landmark -> its position on the map.
         arrows_m: Name -> vector to it.
         time_s: ``(t,)``.
         similarity_error: Name -> one minus the similarity, ``(t,)``.
-        distance_error: Name -> in metres, ``(t,)``.
-        first_seen_s: Name -> when it was first seen; before, curves are pale.
-        title: Heading of the whole figure.
+        distance_error: Name -> error of the vector in metres, ``(t,)``.
+        first_seen_s: Name -> time of the first sight; earlier values are pale.
+        title: Title of the whole figure.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(12.5, 4.3, title)
@@ -202,16 +205,16 @@ def plot_vectors(
                 ax.plot(time_s[~known], errors[name][~known], color="#dddddd", lw=0.7, zorder=1)
                 label = name.replace("_", " ").lower()
                 ax.plot(time_s[known], errors[name][known], color=colour, lw=1.1, label=label)
-        dot = {"ls": "none", "marker": "o", "ms": 7, "mfc": "white", "mec": INK, "mew": 1.3}
-        place.plot(*position_m, zorder=9, **dot)
-        write_title(place, "At the end", "x: recalled · arrows: vectors")
+        dot: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 7, "mfc": "white"}
+        place.plot(*position_m, zorder=9, mec=INK, mew=1.3, **dot)
+        write_title(place, "Map at the end", "x: recalled positions · arrows: vectors")
         alike.set(xlabel="time (s)", ylabel="1 - similarity", xlim=(0, time_s[-1]))
-        known = [distance_error[n][time_s >= first_seen_s[n] + 1.0] for n in estimates_m]
-        most = max((float(e.max()) for e in known if len(e)), default=1.0)
-        far.set(xlabel="time (s)", ylabel="distance (m)", xlim=(0, time_s[-1]))
+        later = [distance_error[n][time_s >= first_seen_s[n] + 1.0] for n in estimates_m]
+        most = max((float(e.max()) for e in later if len(e)), default=1.0)
+        far.set(xlabel="time (s)", ylabel="error (m)", xlim=(0, time_s[-1]))
         far.set_ylim(0, 1.5 * max(most, 1e-3))
-        write_title(alike, "Error of the vector", "pale: not yet seen")
-        write_title(far, "Error of where it points", "scaled to a second after the first sight")
+        write_title(alike, "Dissimilarity of the vector", "pale: not yet seen")
+        write_title(far, "Error of the vector's end", "axis: from 1 s after the first sight")
         handles, labels = alike.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)))
     return figure
@@ -225,23 +228,21 @@ def plot_area(
     title: str,
     threshold: float = 0.5,
 ) -> Figure:
-    """Draw an area that was asked about and what is said to be there (the paper's Fig. 6).
+    """Draw the area of a query and its answer (the paper's Fig. 6).
 
     Args:
-        world: In the plane.
+        world: A world in the plane.
         low_m: Lower corner of the area.
         high_m: Upper corner.
-        amounts: Name -> how much of it is there.
-        title: Heading of the whole figure.
-        threshold: From which on it counts as there.
+        amounts: Name of a landmark -> similarity of its memory with the area.
+        title: Title of the whole figure.
+        threshold: Similarity above which the landmark is in the area.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(9.0, 4.1, title)
         place, bars = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
         draw_world(place, world)
-        place.add_patch(
-            Rectangle(low_m, *(np.asarray(high_m) - low_m), fc="#9a9a9a", alpha=0.45, zorder=2)
-        )
+        place.add_patch(_box(low_m, high_m, fc="#9a9a9a", alpha=0.45, zorder=2))
         write_title(place, "World and area")
         names = list(amounts)
         values = np.array([amounts[name] for name in names])
@@ -251,8 +252,8 @@ def plot_area(
         bars.invert_yaxis()
         bars.axvline(threshold, color=LOOP, lw=1.2, ls="--")
         bars.axvline(0.0, color=INK, lw=0.8)
-        bars.set_xlabel("how much of it is in the area")
-        write_title(bars, "What is there?", "blue: above the dashed threshold")
+        bars.set_xlabel("amount in the area (1 inside, 0 outside)")
+        write_title(bars, "Landmarks in the area", "blue: above the dashed threshold")
     return figure
 
 
@@ -262,13 +263,13 @@ def plot_posterior(
     snapshots: Mapping[str, tuple[np.ndarray, np.ndarray]],
     title: str,
 ) -> Figure:
-    """Draw where an animal believes to be, at some times (the paper's Fig. 3).
+    """Draw the belief of an animal about its position, at some times (the paper's Fig. 3).
 
     Args:
-        world: In the plane.
-        path_m: All of it, ``(t, 2)``.
-        snapshots: What a panel is headed with -> density ``(n_y, n_x)`` and true position.
-        title: Heading of the whole figure.
+        world: A world in the plane.
+        path_m: The whole path, ``(t, 2)``.
+        snapshots: Title of a panel -> probability density ``(n_y, n_x)`` and true position.
+        title: Title of the whole figure.
     """
     (x0, x1), (y0, y1) = world.bounds_m
     with mpl.rc_context(STYLE):
@@ -290,7 +291,7 @@ def plot_posterior(
         for ax in axes[1:]:
             ax.set_ylabel("")
         bar = figure.colorbar(axes[0].images[0], ax=axes, shrink=0.75, pad=0.01)
-        bar.set_label("density over its peak; x: truth")
+        bar.set_label("probability density / peak density; x: truth")
         bar.outline.set_visible(False)
     return figure
 

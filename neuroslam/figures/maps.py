@@ -1,6 +1,6 @@
-"""Figures of maps, cells, views and curves, whole: plain arrays in, a matplotlib ``Figure`` out.
+"""Whole figures of maps, cells, views and signals: arrays in, a matplotlib ``Figure`` out.
 
-:mod:`neuroslam.figures.style` has the colours and what they mean. pyplot is never touched.
+:mod:`neuroslam.figures.style` defines the colours and their meaning. pyplot is not used.
 """
 
 import math
@@ -48,32 +48,32 @@ def plot_map(
     odometry_of: str = "",
     title: str | None = None,
 ) -> Figure:
-    """Draw the experience map, beside the odometry it was made from.
+    """Draw the experience map, beside dead reckoning by its odometry.
 
-    A link is a loop closure when it joins experiences that were both known before.
-    The map is in its own coordinates. ``truth_xy``, and walls with it, are drawn where a similarity
-    alignment lays them over the track, and the legend gives the absolute trajectory error (RMSE,
-    in metres of the truth).
+    A link is a loop closure when it joins experiences that both existed before it. The map is in
+    its own coordinates. ``truth_xy`` and the walls are drawn after a similarity alignment to the
+    track; the legend gives the absolute trajectory error (RMSE after that alignment, in metres of
+    the truth).
 
     Args:
         poses: Experiences ``(n, 3)``: x, y in metres, heading in radians.
         links: Source and target of each link, ``(m, 2)``.
         odometry_xy: Dead-reckoned track ``(k, 2)``; gets a panel of its own.
-        track_xy: Where the map puts the robot in each frame, ``(t, 2)``.
-        truth_xy: Where it was in each frame, ``(t, 2)``; without ``track_xy``: at each experience.
+        track_xy: Position of the robot on the map in each frame, ``(t, 2)``.
+        truth_xy: True position in each frame, ``(t, 2)``; without ``track_xy``: of each experience.
         walls: Ends of wall segments in the frame of the truth, ``(w, 2, 2)``.
-        current: Pose of the robot now, on the map: an arrow, which stands for the end.
-        landmarks: Where landmarks are, on the map, ``(l, 2)``: stars.
+        current: Pose of the robot now, on the map: an arrow, in place of the mark of the end.
+        landmarks: Positions of landmarks on the map, ``(l, 2)``: stars.
         session: Number of the session that made each experience, ``(n,)``, from 0: its colour.
-        session_names: Of the sessions, for the legend; colours repeat after six.
-        odometry_of: Whose odometry it is, for the legend.
-        title: Heading of the whole figure.
+        session_names: Names of the sessions, for the legend; colours repeat after six.
+        odometry_of: Name of the session of the odometry, for the legend.
+        title: Title of the whole figure.
 
     Raises:
-        ValueError: If the truth has another length than the track.
+        ValueError: If the truth and the track differ in length.
     """
     with mpl.rc_context(STYLE):
-        tall = 5.6 + 0.19 * len(session_names)  # a line of the legend each
+        tall = 5.6 + 0.19 * len(session_names)  # a line of the legend for each
         figure = new_figure(11.0 if odometry_xy is not None else 6.2, tall, title)
         axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
@@ -90,12 +90,12 @@ def plot_pose_cells(
     estimate: PoseEstimate | None = None,
     injection: PoseEstimate | None = None,
 ) -> Figure:
-    """Draw the activity packet from above (summed over heading) and from the side (over y).
+    """Draw the activity packet, summed over heading and summed over y.
 
     Args:
-        activity: ``(n_theta, n_y, n_x)``.
+        activity: Activity of the pose cells, ``(n_theta, n_y, n_x)``.
         estimate: Decoded centre of the packet, in cells: a cross.
-        injection: Where the current view injects, in cells: a ring.
+        injection: Centre of the injection by the current view, in cells: a ring.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(9.0, 4.3, "Activity of the pose cells")
@@ -105,11 +105,11 @@ def plot_pose_cells(
 
 
 def plot_activity(layers: np.ndarray | tuple[np.ndarray, ...], title: str) -> Figure:
-    """Draw the activity of a population: layers of cells side by side, or a picture as it is.
+    """Draw the activity of a population: layers of cells side by side, or a picture.
 
     Args:
-        layers: ``(h, w)`` of any scale, or several of them; or ``uint8``, ``(h, w, 3)``.
-        title: Name of the population, or of what is seen.
+        layers: Activity ``(h, w)`` in any unit, or several of them; or ``uint8``, ``(h, w, 3)``.
+        title: Name of the population.
     """
     layers = layers if isinstance(layers, tuple) else (layers,)
     with mpl.rc_context(STYLE):
@@ -128,12 +128,12 @@ def plot_activity(layers: np.ndarray | tuple[np.ndarray, ...], title: str) -> Fi
 def plot_frame_and_template(
     image: np.ndarray, template: np.ndarray, error: float, template_id: int
 ) -> Figure:
-    """Draw a frame above the stored view it was matched with.
+    """Draw a frame above the template that it matched.
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
         template: Grey, ``(h, w)``, ``uint8`` or in [0, 1].
-        error: Mean absolute difference of the match; negative where there was none.
+        error: Match error, a mean absolute difference; negative without a match.
         template_id: Id of the template.
     """
     with mpl.rc_context(STYLE):
@@ -146,12 +146,12 @@ def plot_frame_and_template(
 
 
 def plot_signals(frames: Mapping[str, np.ndarray], threshold: float | None = None) -> Figure:
-    """Draw how well frames were recognised, where there were views, and how the map grew.
+    """Draw the match errors of views, where there are any, and the size of the map over time.
 
     Args:
         frames: The columns ``time_s``, ``match_error``, ``n_templates``, ``n_experiences`` and
             ``n_links`` of ``frames.csv``.
-        threshold: Largest match error that counts as known.
+        threshold: Largest match error of a known view.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(8.0, 4.8 if np.any(frames["n_templates"]) else 2.7, None)
@@ -172,21 +172,21 @@ def plot_precision_recall(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -
             colour, dash = CURVES[number % len(CURVES)], ("-", "--", ":")[number // len(CURVES) % 3]
             axes.plot(recall, precision, dash, color=colour, lw=1.8, label=name, clip_on=False)
         axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="recall", ylabel="precision", aspect="equal")
-        write_title(axes, "Recognised places", counted(len(curves), "method"))
+        write_title(axes, "Place recognition", counted(len(curves), "method"))
         longest = max(map(len, curves), default=1)
         legend_below(axes, columns=max(1, min(3, len(curves), 66 // longest)))
     return figure
 
 
 def contact_sheet(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Draw equally sized pictures in rows, each under its title.
+    """Draw pictures of equal size in rows, each below its title.
 
     Args:
-        images: ``uint8``, all ``(h, w)`` grey or all ``(h, w, 3)`` RGB, of one size.
-        titles: One for each picture.
+        images: ``uint8``, all ``(h, w)`` grey or all ``(h, w, 3)`` RGB.
+        titles: A title for each picture.
 
     Raises:
-        ValueError: If there are no pictures, or sizes or numbers differ.
+        ValueError: If there are no pictures, their sizes differ, or the titles do not match them.
     """
     shapes = {np.shape(image) for image in images}
     if len(shapes) != 1 or len(images) != len(titles):
@@ -232,24 +232,22 @@ def plot_summary(
     current: Pose | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Draw a whole run on one sheet: odometry and map above; cells, last view and counts below.
+    """Draw a run on one sheet: odometry and map above; cells, last view and counts below.
 
-    Everything means what it means in :func:`plot_map`, :func:`plot_pose_cells`,
-    :func:`plot_frame_and_template` and :func:`plot_signals`; what is not given is left out.
-    ``frames`` needs the column ``template`` too, where there is an image.
+    The arguments are those of :func:`plot_map`, :func:`plot_pose_cells`,
+    :func:`plot_frame_and_template` and :func:`plot_signals`; panels without data are left out.
+    With an image, ``frames`` needs the column ``template`` too.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(14.0, 10.0, title)
-        top, bottom = figure.subfigures(2, 1, height_ratios=[1.55, 1.0])
+        top, bottom = figure.subfigures(2, 1, height_ratios=[1.55, 1.0], squeeze=False).ravel()
         axes = top.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
             draw_odometry(axes[0], np.asarray(odometry_xy))
         draw_map(axes[-1], poses, links, track_xy, truth_xy, walls, current)
         widths = [1.75 * (activity is not None), 0.8 * (image is not None), 1.55]
-        parts = bottom.subfigures(
-            1, sum(w > 0 for w in widths), width_ratios=[w for w in widths if w]
-        )
-        parts = list(np.atleast_1d(parts))
+        widths = [width for width in widths if width]
+        parts = list(bottom.subfigures(1, len(widths), width_ratios=widths, squeeze=False)[0])
         if activity is not None:
             part = parts.pop(0)
             draw_pose_cells(part, part.subplots(1, 2), np.asarray(activity), estimate, None)

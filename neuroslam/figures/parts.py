@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,12 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from neuroslam.errors import MapError, counted
-from neuroslam.evaluation.trajectory import absolute_trajectory_error, align, path_length
+from neuroslam.evaluation.trajectory import (
+    AlignmentMode,
+    absolute_trajectory_error,
+    align,
+    path_length,
+)
 from neuroslam.figures.style import (
     ACTIVITY,
     INK,
@@ -37,13 +42,13 @@ _DART = Outline([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0
 
 
 class _Truth(NamedTuple):
-    # The truth, where it lies over the map.
+    # The truth in the coordinates of the map.
     xy: np.ndarray | None
     walls: np.ndarray
     label: str
 
 
-def _lay(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray | None) -> _Truth:
+def _align_truth(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray | None) -> _Truth:
     segments = np.empty((0, 2, 2)) if walls is None else np.asarray(walls).reshape(-1, 2, 2)
     if truth is None or not len(truth):
         return _Truth(None, segments, "")
@@ -53,18 +58,20 @@ def _lay(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray | None) 
             f"plot_map: truth_xy has {len(truth)} points and the track {len(track)}; "
             "give track_xy with a point for each of the truth"
         )
+    mode: AlignmentMode = "similarity"
     try:
-        motion, mode = align(track, truth, "similarity"), "similarity"
-    except MapError:  # a robot that stood still: nothing to align, but there is still an error
-        motion, mode = align(track, truth, "none"), "none"
+        alignment = align(track, truth, mode)
+    except MapError:  # a robot that stood still fixes no rotation, but there is still an error
+        mode = "none"
+        alignment = align(track, truth, mode)
     ate = absolute_trajectory_error(track, truth, mode).rmse
-    how = f"scaled by {1.0 / motion.scale:.3g}" if mode == "similarity" else "not aligned"
-    walls_there = motion.undo(segments.reshape(-1, 2)).reshape(-1, 2, 2)
-    return _Truth(motion.undo(truth), walls_there, f"truth: ATE {_metres(ate)}, {how}")
+    how = f"scaled by {1.0 / alignment.scale:.3g}" if mode == "similarity" else "not aligned"
+    walls_on_map = alignment.undo(segments.reshape(-1, 2)).reshape(-1, 2, 2)
+    return _Truth(alignment.undo(truth), walls_on_map, f"truth: ATE {_metres(ate)}, {how}")
 
 
 def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "") -> None:
-    """Draw a dead-reckoned track ``(k, 2)``, and say in the legend which session's it is."""
+    """Draw a dead-reckoned track ``(k, 2)``; the legend names its session, if given."""
     axes.plot(*xy.T, color=ODOMETRY, lw=1.1, label=f"odometry of {whose}" if whose else "odometry")
     _draw_ends(axes, xy)
     write_title(axes, "Odometry alone", f"{counted(len(xy), 'frame')} · {path_length(xy):,.1f} m")
@@ -83,30 +90,31 @@ def draw_map(
     session: np.ndarray | None = None,
     names: Sequence[str] = (),
 ) -> None:
-    """Draw experiences, links, loop closures, landmarks and robot, and the truth laid over them."""
+    """Draw experiences, links, loop closures, landmarks, the robot, and the aligned truth."""
     poses, links = np.asarray(poses).reshape(-1, 3), np.asarray(links, np.int64).reshape(-1, 2)
     xy, is_loop = poses[:, :2], closes_loop(links[:, 0], links[:, 1])
     counts = ((len(xy), "experience"), (len(links), "link"), (int(is_loop.sum()), "loop closure"))
     write_title(axes, "Experience map", " · ".join(counted(*count) for count in counts))
     if not len(xy):
-        axes.text(0.5, 0.5, "no places", transform=axes.transAxes, ha="center", va="center")
+        axes.text(0.5, 0.5, "no experiences", transform=axes.transAxes, ha="center", va="center")
         axes.set(xticks=[], yticks=[])
         return
-    true = _lay(xy if track is None else track, truth, walls)
+    true = _align_truth(xy if track is None else track, truth, walls)
     spots = np.empty((0, 2)) if landmarks is None else np.asarray(landmarks).reshape(-1, 2)
     if len(true.walls):
-        lines = LineCollection(true.walls, colors=WALL, lw=2.5, zorder=1, label="walls")
+        lines = LineCollection([*true.walls], colors=WALL, lw=2.5, zorder=1, label="walls")
         axes.add_collection(lines)
-    _draw_places(axes, xy, links[~is_loop], session, names)
+    _draw_experiences(axes, xy, links[~is_loop], session, names)
     if is_loop.any():
+        loops = [*xy[links[is_loop]]]
         axes.add_collection(
-            LineCollection(xy[links[is_loop]], colors=LOOP, lw=1.3, zorder=4, label="loop closure")
+            LineCollection(loops, colors=LOOP, lw=1.3, zorder=4, label="loop closure")
         )
     if true.xy is not None:
         axes.plot(*true.xy.T, "--", color=TRUTH, lw=0.9, zorder=5, label=true.label)
     if len(spots):
-        style = {"ls": "none", "marker": "*", "ms": 10, "mfc": LANDMARK, "mec": INK, "mew": 0.5}
-        axes.plot(*spots.T, zorder=6, label="landmarks", **style)
+        style: dict[str, Any] = {"ls": "none", "marker": "*", "ms": 10, "mfc": LANDMARK}
+        axes.plot(*spots.T, zorder=6, label="landmarks", mec=INK, mew=0.5, **style)
     _draw_ends(axes, xy, end=current is None)
     if current is not None:
         draw_robot(axes, current, "robot now")
@@ -115,35 +123,36 @@ def draw_map(
 
 
 def draw_robot(axes: Axes, pose: Pose, label: str) -> None:
-    """Draw a dart where a robot is, pointing where it heads."""
+    """Draw the pose of a robot as a dart that points along its heading."""
     marker = MarkerStyle(_DART).rotated(rad=pose.theta_rad)
-    style = {"ls": "none", "marker": marker, "ms": 13, "mfc": ROBOT, "mec": INK, "mew": 0.8}
+    style: dict[str, Any] = {"ls": "none", "marker": marker, "ms": 13, "mfc": ROBOT}
+    style |= {"mec": INK, "mew": 0.8}
     axes.plot(*pose[:2], zorder=8, label=label, **style)
 
 
-def _draw_places(
+def _draw_experiences(
     axes: Axes,
     xy: np.ndarray,
     links: np.ndarray,
     session: np.ndarray | None,
     names: Sequence[str],
 ) -> None:
-    """Draw experiences and the links between neighbours in time, by session where there are."""
-    whose = np.zeros(len(xy), np.int64) if session is None else np.asarray(session)
-    maker = whose[links].max(axis=1)  # the later one made it
-    style = {"ls": "none", "marker": "o", "mew": 0, "zorder": 3}
+    """Draw experiences and the links between neighbours in time, in the colours of sessions."""
+    owner = np.zeros(len(xy), np.int64) if session is None else np.asarray(session)
+    link_owner = owner[links].max(axis=1)  # the later session made the link
+    style: dict[str, Any] = {"ls": "none", "marker": "o", "mew": 0, "zorder": 3}
     style["ms"] = float(np.clip(50.0 / math.sqrt(max(1, len(xy))), 2.0, 4.5))
     for number, name in enumerate(names or ["experiences, links"]):
-        colour, mine = SESSIONS[number % len(SESSIONS)], xy[whose == number]
-        lines = xy[links[maker == number]]
+        colour, own = SESSIONS[number % len(SESSIONS)], xy[owner == number]
+        lines = [*xy[links[link_owner == number]]]
         axes.add_collection(LineCollection(lines, colors=colour, lw=0.9, alpha=0.8, zorder=2))
-        axes.plot(*mine.T, color=colour, **style)
-        label = name if len(mine) else f"{name}: no place of its own"
+        axes.plot(*own.T, color=colour, **style)
+        label = name if len(own) else f"{name}: no experience of its own"
         axes.plot([], [], "-o", color=colour, lw=0.9, ms=4, label=label)
 
 
 def _draw_ends(axes: Axes, xy: np.ndarray, end: bool = True) -> None:
-    style = {"ls": "none", "mec": INK, "mew": 1.4, "zorder": 7}
+    style: dict[str, Any] = {"ls": "none", "mec": INK, "mew": 1.4, "zorder": 7}
     if len(xy):
         axes.plot(*xy[0], marker="o", ms=8, mfc="white", label="start", **style)
     if len(xy) and end:
@@ -157,7 +166,7 @@ def draw_pose_cells(
     estimate: PoseEstimate | None,
     injection: PoseEstimate | None,
 ) -> None:
-    """Draw activity from above and from the side, with its colour bar."""
+    """Draw the activity summed over heading and summed over y, with a colour bar."""
     n_theta, n_y, n_x = activity.shape
     step = 360.0 / n_theta
     above, side = activity.sum(axis=0), activity.sum(axis=1)
@@ -174,18 +183,19 @@ def draw_pose_cells(
         ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
         ax.grid(visible=False)
         ax.set_box_aspect(n_y / n_x)
-    write_title(axes[0], "Place", "summed over θ")
+    write_title(axes[0], "Position", "summed over θ")
     write_title(axes[1], "Heading", "summed over y")
     axes[1].set_yticks(range(0, 360, 90))
     marks = ((injection, "o", "view injects here", 15), (estimate, "x", "estimate", 9))
     for mark, marker, label, size in marks:
         if mark is not None:
-            style = {"ls": "none", "marker": marker, "ms": size, "mew": 2.2, "mfc": "none"}
+            style: dict[str, Any] = {"ls": "none", "marker": marker, "ms": size, "mew": 2.2}
+            style["mfc"] = "none"
             axes[0].plot(mark.x, mark.y, mec=LOOP, label=label, **style)
             axes[1].plot(mark.x, mark.theta * step, mec=LOOP, **style)
     if axes[0].get_legend_handles_labels()[0]:
         legend_below(axes[0], columns=2)
-    bar = figure.colorbar(picture, cax=axes[1].inset_axes([1.04, 0.0, 0.045, 1.0]))
+    bar = figure.colorbar(picture, cax=axes[1].inset_axes((1.04, 0.0, 0.045, 1.0)))
     bar.set_label("share of all activity")
     bar.outline.set_visible(False)
 
@@ -198,18 +208,18 @@ def draw_frame(axes: Axes, image: np.ndarray) -> None:
 
 
 def draw_template(axes: Axes, template: np.ndarray, error: float, template_id: int) -> None:
-    """Draw a stored view, and how well it was matched."""
+    """Draw a template and its match error."""
     top = 255 if template.dtype == np.uint8 else 1.0
     axes.imshow(template, "gray", vmin=0, vmax=top, interpolation="nearest")
-    said = f"match error {error:.3f}" if error >= 0 else "the first view"
-    write_title(axes, f"Template {template_id}", said)
+    note = f"match error {error:.3f}" if error >= 0 else "the first view"
+    write_title(axes, f"Template {template_id}", note)
     axes.set_axis_off()
 
 
 def draw_signals(
     figure: Figure | SubFigure, frames: Mapping[str, np.ndarray], threshold: float | None
 ) -> None:
-    """Draw match errors, where there were views, and counts, over time."""
+    """Draw match errors, where views were matched, and counts, over time."""
     has_views = bool(np.any(frames["n_templates"]))
     axes = figure.subplots(1 + has_views, 1, sharex=True, squeeze=False)[:, 0]
     if has_views:
@@ -223,7 +233,7 @@ def draw_signals(
     axes[-1].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes[-1].yaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
     axes[-1].set_ylim(0, max(1.0, axes[-1].get_ylim()[1]))
-    write_title(axes[-1], "Memory")
+    write_title(axes[-1], "Size of the map")
     _legend_above(axes[-1])
 
 
@@ -235,20 +245,21 @@ def _draw_recognition(
     error = np.where(error < 0, np.nan, error)
     is_new = np.zeros(len(error), bool) if threshold is None else error > threshold
     size = float(np.clip(80.0 / math.sqrt(max(1, len(time))), 2.5, 6.0))
-    dots = {"ls": "none", "marker": ".", "ms": size, "mew": 0}
+    dots: dict[str, Any] = {"ls": "none", "marker": ".", "ms": size, "mew": 0}
     axes.plot(time[~is_new], error[~is_new], color=MAP, label="known view", **dots)
     if threshold is not None:
         axes.plot(time[is_new], error[is_new], color=LOOP, label="new view", **dots)
         axes.axhline(threshold, color=INK, lw=0.9, ls="--", label=f"threshold {threshold:g}")
-    axes.set(ylabel="match error")
+    axes.set(ylabel="match error\n(grey levels, 0 to 1)")
     axes.set_ylim(bottom=0.0)
-    write_title(axes, "Recognition")
+    write_title(axes, "View matches")
     _legend_above(axes, markerscale=8.0 / size)
 
 
 def _legend_above(axes: Axes, markerscale: float = 1.0) -> None:
     axes.margins(x=0.01)
-    style = {"columnspacing": 0.9, "handletextpad": 0.4, "handlelength": 1.1, "fontsize": 8}
+    style: dict[str, Any] = {"columnspacing": 0.9, "handletextpad": 0.4, "fontsize": 8}
+    style["handlelength"] = 1.1
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=3, markerscale=markerscale, **style
     )
@@ -260,7 +271,7 @@ def _metric(axes: Axes) -> None:
     axes.margins(0.06)
     seen = axes.dataLim.get_points() if axes.has_data() else np.zeros((2, 2))
     seen = np.where(np.isfinite(seen), seen, 0.0)
-    if np.ptp(seen, axis=0).max() < 0.1:  # a point, or nothing, has no extent of its own
+    if np.ptp(seen, axis=0).max() < 0.1:  # a single point has no extent
         axes.update_datalim(seen.mean(axis=0) + np.array([[-0.05, -0.05], [0.05, 0.05]]))
         axes.autoscale_view()
     labels = axes.get_legend_handles_labels()[1]

@@ -1,4 +1,4 @@
-"""Figures of neurons that spike and of where an animal believes it is; plain arrays in."""
+"""Figures of spiking neurons and of position estimates; arrays in, a ``Figure`` out."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -16,13 +16,13 @@ _BAND = 0.22  # opacity
 
 
 class Spikes(NamedTuple):
-    """Where a neuron fired.
+    """Spikes of a neuron on a path.
 
     Attributes:
-        title: Which neuron.
-        note: What is known of it.
-        path_m: Way of the animal, ``(t, 2)``.
-        places_m: Where it was at each spike, ``(n, 2)``.
+        title: The neuron.
+        note: A note at the right of the title.
+        path_m: Path of the animal, ``(t, 2)``.
+        places_m: Position of the animal at each spike, ``(n, 2)``.
         landmarks_m: ``(k, 2)``, or ``None``.
     """
 
@@ -34,11 +34,11 @@ class Spikes(NamedTuple):
 
 
 class Headings(NamedTuple):
-    """How often a neuron fired by the direction in which the animal went.
+    """Firing rate of a neuron by the direction of motion.
 
     Attributes:
-        title: Which neuron.
-        rate_hz: In each bin, over the full turn from east, counter-clockwise, ``(n,)``.
+        title: The neuron.
+        rate_hz: Rate in each bin, over the full turn from east, counter-clockwise, ``(n,)``.
     """
 
     title: str
@@ -46,14 +46,14 @@ class Headings(NamedTuple):
 
 
 class Run(NamedTuple):
-    """An estimate beside the truth.
+    """A position estimate and its error.
 
     Attributes:
-        label: Whose.
+        label: The method.
         time_s: ``(t,)``.
         position_m: ``(t, dimension)``.
-        error_m: Distance from the truth, ``(t,)``.
-        probability: Density that it gives the truth, over the highest that it gives, ``(t,)``.
+        error_m: Distance to the truth, ``(t,)``.
+        probability: Density at the true position over the peak density, ``(t,)``.
     """
 
     label: str
@@ -64,7 +64,7 @@ class Run(NamedTuple):
 
 
 def draw_spikes(axes: Axes, cell: Spikes) -> None:
-    """Draw the spikes of a neuron, as dots on the path."""
+    """Draw the spikes of a neuron as dots on the path."""
     axes.plot(*cell.path_m.T, color=_PATH, lw=0.6, zorder=1)
     axes.plot(*cell.places_m.T, ls="none", marker=".", ms=2.5, mew=0, color=LOOP, zorder=2)
     if cell.landmarks_m is not None:
@@ -76,7 +76,7 @@ def draw_spikes(axes: Axes, cell: Spikes) -> None:
 
 
 def draw_headings(axes: Axes, cell: Headings) -> None:
-    """Draw rates by heading, on polar axes."""
+    """Draw firing rates by direction of motion, on polar axes."""
     n = len(cell.rate_hz)
     angle = (np.arange(n) + 0.5) * 2.0 * np.pi / n
     axes.bar(angle, cell.rate_hz, width=2.0 * np.pi / n, color=MAP, ec="white", lw=0.5)
@@ -89,24 +89,24 @@ def plot_spikes(rows: Sequence[Sequence[Spikes | Headings]], title: str) -> Figu
     """Draw neurons side by side: spikes on the path, or rates by heading (the paper's Fig. 7).
 
     Args:
-        rows: Of panels.
-        title: Heading of the whole figure.
+        rows: Rows of panels.
+        title: Title of the whole figure.
     """
     width = max(map(len, rows))
     with mpl.rc_context(STYLE):
         figure = new_figure(3.2 * width + 0.3, 3.35 * len(rows) + 0.5, title)
         for i, row in enumerate(rows):
             for j, cell in enumerate(row):
-                polar = isinstance(cell, Headings)
-                axes = figure.add_subplot(
-                    len(rows), width, i * width + j + 1, projection="polar" if polar else None
-                )
-                (draw_headings if polar else draw_spikes)(axes, cell)
+                at = (len(rows), width, i * width + j + 1)
+                if isinstance(cell, Headings):
+                    draw_headings(figure.add_subplot(*at, projection="polar"), cell)
+                else:
+                    draw_spikes(figure.add_subplot(*at), cell)
     return figure
 
 
 def draw_raster(axes: Axes, spikes: np.ndarray, time_step_s: float, start_s: float = 0.0) -> None:
-    """Draw which neuron fired when, ``(steps, neurons)``."""
+    """Draw a raster of spikes, ``(steps, neurons)``."""
     step, neuron = np.nonzero(spikes)
     axes.plot(start_s + step * time_step_s, neuron, ls="none", marker="|", ms=2, mew=0.5, color=INK)
     axes.set(
@@ -126,8 +126,8 @@ def plot_rasters(
     Args:
         populations: Name -> spikes, ``(steps, neurons)``.
         time_step_s: Length of a step.
-        start_s: Time of the first.
-        title: Heading of the whole figure.
+        start_s: Time of the first step.
+        title: Title of the whole figure.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(8.5, 1.7 * len(populations) + 0.7, title)
@@ -135,7 +135,7 @@ def plot_rasters(
         for ax, (name, spikes) in zip(axes, populations.items(), strict=True):
             draw_raster(ax, spikes, time_step_s, start_s)
             rate = spikes.mean() / time_step_s
-            write_title(ax, name, f"{spikes.shape[1]} neurons, {rate:.0f} Hz on average")
+            write_title(ax, name, f"{spikes.shape[1]} neurons, mean rate {rate:.0f} Hz")
             ax.label_outer()
     return figure
 
@@ -146,15 +146,15 @@ def plot_errors(
     title: str,
     log: bool = True,
 ) -> Figure:
-    """Draw errors over time, mean over trials with a band of their spread (the paper's Fig. 8).
+    """Draw errors over time: mean and 10th to 90th percentile over trials (the paper's Fig. 8).
 
-    Each is the mean over a second: what is said wavers with every spike.
+    Errors are averaged over a second, as estimates fluctuate with every spike.
 
     Args:
         time_s: ``(t,)``.
-        panels: What an error is, with its unit -> method -> errors, ``(t, trials)``.
-        title: Heading of the whole figure.
-        log: On a logarithmic axis, where the band is from the 10th to the 90th percentile.
+        panels: Name of an error, with its unit -> method -> errors, ``(t, trials)``.
+        title: Title of the whole figure.
+        log: Use a logarithmic axis.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(5.4 * len(panels), 3.9, title)
@@ -185,8 +185,8 @@ def plot_trials(
     """Draw paths of trials beside each other (the paper's Fig. 9).
 
     Args:
-        trials: What a panel is headed with -> the true path, landmarks, and method -> estimate.
-        title: Heading of the whole figure.
+        trials: Title of a panel -> the true path, landmarks, and method -> estimated path.
+        title: Title of the whole figure.
     """
     columns = min(5, len(trials))
     rows = -(-len(trials) // columns)
@@ -219,13 +219,13 @@ def plot_trials(
 def plot_3d(
     truth: np.ndarray, estimates: Mapping[str, np.ndarray], landmarks: np.ndarray | None, title: str
 ) -> Figure:
-    """Draw paths in three dimensions (the paper's Fig. 10), with their shadow on the floor.
+    """Draw paths in three dimensions (the paper's Fig. 10), the true one also on the floor.
 
     Args:
-        truth: ``(t, 3)``.
-        estimates: Method -> ``(t, 3)``.
+        truth: True path, ``(t, 3)``.
+        estimates: Method -> estimated path, ``(t, 3)``.
         landmarks: ``(k, 3)``, or ``None``.
-        title: Heading of the whole figure.
+        title: Title of the whole figure.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(6.6, 6.0, title)
@@ -247,14 +247,14 @@ def plot_dead_reckoning(truth: Run, runs: Sequence[Run], title: str) -> Figure:
     """Draw components, probability of the truth and error over time (the paper's Fig. 11).
 
     Args:
-        truth: Its error is not looked at.
+        truth: The true path; its error is not used.
         runs: Estimates at the same times.
-        title: Heading of the whole figure.
+        title: Title of the whole figure.
     """
     dimension = truth.position_m.shape[1]
     with mpl.rc_context(STYLE):
         figure = new_figure(10.5, 1.75 * dimension + 1.4, title)
-        left, right = figure.subfigures(1, 2, wspace=0.03)
+        left, right = figure.subfigures(1, 2, wspace=0.03, squeeze=False)[0]
         axes = left.subplots(dimension, 1, sharex=True, squeeze=False).ravel()
         for k, ax in enumerate(axes):
             ax.plot(truth.time_s, truth.position_m[:, k], color="#bcbcbc", lw=3.0, label="truth")
@@ -262,19 +262,18 @@ def plot_dead_reckoning(truth: Run, runs: Sequence[Run], title: str) -> Figure:
                 ax.plot(run.time_s, run.position_m[:, k], color=colour, lw=0.9, label=run.label)
             ax.set_ylabel(f"{'xyzuvw'[k]} (m)")
         axes[-1].set_xlabel("time (s)")
-        write_title(axes[0], "Where it believes to be")
+        write_title(axes[0], "Position, true and estimated")
         probability, error = right.subplots(2, 1, sharex=True)
         for run, colour in zip(runs, CURVES, strict=False):
             if run.probability is not None:
                 probability.plot(run.time_s, run.probability, color=colour, lw=0.9)
-            # Root of the mean square until then, as well as the error itself.
             rmse = np.sqrt(np.cumsum(run.error_m**2) / np.arange(1, len(run.error_m) + 1))
             error.plot(run.time_s, run.error_m, color=colour, lw=0.6, alpha=0.5)
             error.plot(run.time_s, rmse, color=colour, lw=1.6)
-        probability.set(ylabel="share of the peak", ylim=(0, 1.05))
+        probability.set(ylabel="density / peak density", ylim=(0, 1.05))
         error.set(xlabel="time (s)", ylabel="error (m)", ylim=(0, None))
-        write_title(probability, "Probability of the truth")
-        write_title(error, "Distance from the truth", "thick: RMSE until then")
+        write_title(probability, "Probability density at the true position")
+        write_title(error, "Distance to the true position", "thick: RMSE since the start")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     return figure
@@ -286,7 +285,7 @@ def plot_signals(time_s: np.ndarray, signals: Mapping[str, np.ndarray], title: s
     Args:
         time_s: ``(t,)``.
         signals: Name with its unit -> ``(t,)``.
-        title: Heading of the whole figure.
+        title: Title of the whole figure.
     """
     with mpl.rc_context(STYLE):
         figure = new_figure(8.5, 1.35 * len(signals) + 0.7, title)

@@ -1,14 +1,14 @@
-"""What all figures have in common: colours, lettering, empty figures, and how they are saved.
+"""Common style of all figures: colours, fonts, empty figures, and saving.
 
-One visual language: grey is odometry, blue the map, vermilion a loop closure, black dashes the
-truth; a circle is the start, a square the end, an arrow the robot now; where a map is of several
-sessions each has a colour. The colours are those of M. Okabe and K. Ito's palette, which
-colour-blind readers can tell apart.
+Grey is odometry, blue the map, vermilion a loop closure, black dashes the truth; a circle is the
+start, a square the end, an arrow the robot now; each session of a map has its colour. The colours
+are those of the palette of M. Okabe and K. Ito, which colour-blind readers can distinguish.
 """
 
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -30,16 +30,16 @@ SESSIONS = (MAP, ROBOT, OTHER, "#CC79A7", "#56B4E9", "#882255")
 CURVES = (MAP, LOOP, OTHER, "#CC79A7", "#E69F00", "#56B4E9")
 ACTIVITY = "viridis"
 
-# DejaVu lacks the scripts of East Asia: names in them are drawn with the first of these there is.
+# DejaVu lacks East Asian scripts: names in them use the first of these fonts that is installed.
 _EAST_ASIAN = (
     "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans JP", "Noto Sans SC", "Source Han Sans",
     "Hiragino Sans", "PingFang SC", "Yu Gothic", "Microsoft YaHei", "Malgun Gothic",
     "WenQuanYi Zen Hei", "Droid Sans Fallback", "IPAGothic", "Arial Unicode MS",
 )  # fmt: skip
-_THERE = set(fontManager.get_font_names())
+_INSTALLED = set(fontManager.get_font_names())
 
-STYLE = {
-    "font.family": ["DejaVu Sans", *(name for name in _EAST_ASIAN if name in _THERE)],
+STYLE: dict[Any, Any] = {  # names of matplotlib's settings -> values
+    "font.family": ["DejaVu Sans", *(name for name in _EAST_ASIAN if name in _INSTALLED)],
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -62,7 +62,7 @@ STYLE = {
 
 
 def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
-    """Make an empty figure that is drawn off screen."""
+    """Return an empty figure for drawing off screen."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     if title:
@@ -71,25 +71,28 @@ def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
 
 
 def write_title(axes: Axes, name: str, counts: str = "") -> None:
-    """Write what is seen at the left, and how much of it at the right."""
+    """Write the title at the left of a panel, and counts or notes at the right."""
     axes.set_title(name)
     axes.set_title(counts, loc="right", fontsize=8, fontweight="normal")
 
 
 def legend_below(axes: Axes, columns: int) -> None:
-    """Put the legend outside the data."""
-    under = axes.transAxes + ScaledTranslation(0, -0.42, axes.figure.dpi_scale_trans)  # inches
+    """Put the legend below the axes."""
+    figure = axes.get_figure(root=True)
+    if figure is None:
+        raise ValueError("legend_below: the axes belong to no figure; make them with subplots()")
+    under = axes.transAxes + ScaledTranslation(0, -0.42, figure.dpi_scale_trans)  # inches
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), bbox_transform=under, ncols=columns)
 
 
 def as_rgb(image: np.ndarray) -> np.ndarray:
-    """Give a grey picture three equal channels."""
+    """Return a picture with three channels; those of a grey one are equal."""
     image = np.asarray(image)
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
 def write_decimals(axis: Axis) -> None:
-    """Write few and plain numbers on a logarithmic axis.
+    """Label a logarithmic axis with few, plain decimal numbers.
 
     Example:
         >>> axes = new_figure(3.0, 3.0, None).subplots()
@@ -107,12 +110,12 @@ def write_decimals(axis: Axis) -> None:
 
 
 def plain_text(text: str) -> str:
-    """Write a name as it is: a $ would begin a formula."""
+    """Escape a name for matplotlib, where a $ begins a formula."""
     return text.replace("$", r"\$")
 
 
 def shortened(name: str, most: int = 44) -> str:
-    """Cut the middle out of a long name: sources differ where they begin or end.
+    """Shorten a long name in the middle: names of sources differ at their beginning or end.
 
     Example:
         >>> shortened("world:ellipse?laps=2&seed=1", 20)
@@ -123,7 +126,7 @@ def shortened(name: str, most: int = 44) -> str:
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a figure as PNG, whole or not at all; equal figures give equal bytes."""
+    """Write a figure as PNG, atomically; equal figures give equal bytes."""
     with mpl.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # a name in a script that no font has
         write_atomically(
@@ -135,9 +138,10 @@ def save(figure: Figure, path: Path, dpi: int = 150) -> None:
 
 
 def render(figure: Figure, dpi: int = 100) -> np.ndarray:
-    """Draw a figure into pixels: ``uint8``, ``(h, w, 3)``."""
+    """Render a figure to pixels: ``uint8``, ``(h, w, 3)``."""
     figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
     with mpl.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")
-        figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -1,4 +1,4 @@
-"""The figure of a sweep, errors and counts over what was varied: rows in, a ``Figure`` out."""
+"""The figure of a parameter sweep: errors and counts over the parameters varied."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -23,24 +23,24 @@ _PANELS = {
     "place_cells": "place cells",
 }
 _DASHES = ("-", "--", ":", "-.")
-_APART = 4.0  # largest value over the smallest from which a logarithmic axis is easier to read
+_LOG_RATIO = 4.0  # largest value over the smallest from which the axis is logarithmic
 
 
 def plot_sweep(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> Figure:
-    """Draw errors and counts of runs over what was varied first; a line for each of the rest.
+    """Draw errors and counts of runs over the first parameter varied; a line for each other value.
 
-    Lines go through means over seeds, dots are single runs. Runs that failed are left out.
+    Lines go through means over seeds, dots are single runs. Failed runs are left out.
 
     Args:
-        rows: Of :func:`neuroslam.runs.sweep.sweep`.
-        varied: Keys of what was varied, of which ``source`` may be one; the seed is none.
+        rows: Rows of :func:`neuroslam.runs.sweep.sweep`.
+        varied: Keys of the parameters varied, and ``source`` if sources were; without the seed.
 
     Raises:
-        ValueError: If no run went well.
+        ValueError: If no run succeeded.
     """
     done = [row for row in rows if "experiences" in row]
     if not done:
-        raise ValueError(f"plot_sweep: got {len(rows)} rows, none of a run that went well")
+        raise ValueError(f"plot_sweep: got {len(rows)} rows, expected one of a run that succeeded")
     keys = [key for key in varied if len({str(row[key]) for row in rows}) > 1]
     across = next((key for key in keys if key != "source"), "source")
     rest = [key for key in keys if key != across]
@@ -65,7 +65,7 @@ def plot_sweep(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> Figu
             for number, group in enumerate(lines.values()):
                 aside = (number + 1) / (len(lines) + 1) - 0.5
                 colour, dash = _look(number)
-                # Earlier lines are wider: where several lie on each other, all are seen.
+                # Earlier lines are wider, so that lines of equal values stay visible.
                 lw = 1.6 + 1.4 * min(4, len(lines) - 1 - number) * (labels is None)
                 line = _Line(group, key, colour, dash, lw, aside, 0.35 / (len(lines) + 1))
                 _draw(axes, line, across, places, labels is None)
@@ -76,12 +76,12 @@ def plot_sweep(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> Figu
             _number(axes, places, labels)
         for axes in every[len(panels) :]:
             axes.set_axis_off()
-        key = _key(list(lines), "ate_rmse_m" in panels)
-        if len(key) > 1:
-            longest = max(0.075 * len(line.get_label()) + 0.6 for line in key)
-            ncols = max(1, min(len(key), int(wide / longest)))
-            figure.legend(handles=key, loc="outside lower center", ncols=ncols)
-            figure.set_figheight(figure.get_figheight() + 0.2 * -(-len(key) // ncols))
+        handles = _legend(list(lines), "ate_rmse_m" in panels)
+        if len(handles) > 1:
+            longest = max(0.075 * len(str(line.get_label())) + 0.6 for line in handles)
+            ncols = max(1, min(len(handles), int(wide / longest)))
+            figure.legend(handles=handles, loc="outside lower center", ncols=ncols)
+            figure.set_figheight(figure.get_figheight() + 0.2 * -(-len(handles) // ncols))
     return figure
 
 
@@ -91,8 +91,8 @@ class _Line(NamedTuple):
     colour: str
     dash: str
     width: float
-    aside: float  # of its place across, where places are names, from -0.5 to 0.5
-    half: float  # of the width of a mean there
+    aside: float  # offset from the position of a named value, from -0.5 to 0.5
+    half: float  # half the width of the mean there
 
 
 def _look(number: int) -> tuple[str, str]:
@@ -100,7 +100,7 @@ def _look(number: int) -> tuple[str, str]:
 
 
 def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[str] | None]:
-    """Say where each value lies across, and what is written there if they are no numbers."""
+    """Return the position of each value on the axis, and labels where values are no numbers."""
     distinct = {str(value): value for value in values}
     numbers = [isinstance(v, int | float) and not isinstance(v, bool) for v in distinct.values()]
     if all(numbers):
@@ -118,7 +118,7 @@ def _number(axes: Axes, places: Mapping[str, float], labels: list[str] | None) -
         axes.set_xlim(-0.5, len(labels) - 0.5)
         return
     ticks = sorted(places.values())
-    if ticks[0] > 0 and ticks[-1] / ticks[0] >= _APART:
+    if ticks[0] > 0 and ticks[-1] / ticks[0] >= _LOG_RATIO:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_minor_locator(FixedLocator([]))
@@ -127,14 +127,14 @@ def _number(axes: Axes, places: Mapping[str, float], labels: list[str] | None) -
 
 
 def _draw(axes: Axes, line: _Line, across: str, places: Mapping[str, float], numbers: bool) -> None:
-    """Draw the mean at each place, joined where places are numbers, and a dot for each run."""
+    """Draw the mean at each value, joined where values are numbers, and a dot for each run."""
     found: dict[float, list[float]] = {}
     for row in line.rows:
         if line.key in row:
             found.setdefault(places[str(row[across])], []).append(row[line.key])
     where = sorted(found)
     means = [float(np.mean(found[x])) for x in where]
-    look = {"color": line.colour, "lw": line.width, "zorder": 3}
+    look: dict[str, Any] = {"color": line.colour, "lw": line.width, "zorder": 3}
     if numbers:
         axes.plot(where, means, line.dash, **look)
     else:
@@ -149,15 +149,15 @@ def _draw(axes: Axes, line: _Line, across: str, places: Mapping[str, float], num
     )  # fmt: skip
 
 
-def _key(names: Sequence[str], odometry: bool) -> list[Line2D]:
-    key = []
+def _legend(names: Sequence[str], odometry: bool) -> list[Line2D]:
+    handles = []
     for number, name in enumerate(names):
         colour, dash = _look(number)
         label = textwrap.shorten(name or "map", 80, placeholder=" …")
-        key.append(Line2D([], [], color=colour, ls=dash, lw=1.8, marker="o", ms=4, label=label))
+        handles.append(Line2D([], [], color=colour, ls=dash, lw=1.8, marker="o", ms=4, label=label))
     if odometry:
-        key.append(Line2D([], [], color=ODOMETRY, marker="o", ms=4, label="odometry alone"))
-    return key
+        handles.append(Line2D([], [], color=ODOMETRY, marker="o", ms=4, label="odometry alone"))
+    return handles
 
 
 def _named(key: str, value: object) -> str:

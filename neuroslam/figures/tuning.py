@@ -1,6 +1,5 @@
-"""The figure of a tuning: what was compared, what was chosen, and the map before and after."""
+"""The figure of a tuning: candidates, the choice, and the map before and after."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,33 +26,38 @@ from neuroslam.figures.style import (
 )
 
 
-class Trial(Protocol):
-    """What is drawn of a map: :class:`neuroslam.tuning.search.Trial` has it all."""
-
-    config: BrainConfig
-    inconsistency: float
-    n_places: int
-    track_xy: np.ndarray
-
-
 class Tuning(Protocol):
-    """What is drawn of a tuning: :class:`neuroslam.tuning.tune.Tuning` has it all."""
+    """A tuning, as far as it is drawn; see :class:`neuroslam.tuning.tune.Tuning`.
+
+    Tuning imports figures, so the types of its parts cannot be named here.
+    """
 
     config: BrainConfig
     keys: np.ndarray
     changes: dict[str, tuple[Any, Any, str]]
     revisits: Any
-    views: Sequence[Any]
+    views: list[Any]
     motion: Any
-    trials: Sequence[Trial]
-    before: Trial
-    after: Trial
+    trials: list[Any]
+    before: Any
+    after: Any
 
 
 def plot_tuning(tuning: Tuning, name: str) -> Figure:
-    """Draw what tuning compared and chose, and the map before and after."""
+    """Draw the candidates and choices of a tuning, and the map before and after.
+
+    Args:
+        tuning: A finished tuning.
+        name: Name of the source, for the title.
+
+    Raises:
+        ValueError: If a map, before or after, is missing.
+    """
+    before, after = tuning.before, tuning.after
+    if before is None or after is None:
+        raise ValueError("plot_tuning: the tuning has no map before or after; finish it first")
     n, found = len(tuning.keys), len(tuning.revisits.same)
-    title = f"{Path(name).name}: {100 * found / n:.0f} % of {n} key frames show a place seen twice"
+    title = f"{Path(name).name}: {100 * found / n:.0f} % of {n} key frames revisit a place"
     with mpl.rc_context(STYLE):
         figure = new_figure(13.0, 8.0, plain_text(title))
         axes = figure.subplots(2, 3)
@@ -62,37 +66,38 @@ def plot_tuning(tuning: Tuning, name: str) -> Figure:
         _draw_field_of_view(axes[0, 2], tuning)
         _draw_maps(axes[1, 0], tuning)
         unit = "arbitrary unit" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
-        before, after = tuning.before, tuning.after
         turned = _turned(after.track_xy, before.track_xy)
-        _draw_track(axes[1, 1], before, before.track_xy, "Before", unit)
-        _draw_track(axes[1, 2], after, turned, "Found", unit)
+        _draw_track(
+            axes[1, 1], _counts(before), before.track_xy, "Map with the config before", unit
+        )
+        _draw_track(axes[1, 2], _counts(after), turned, "Map with the config found", unit)
         if turned is not after.track_xy:
-            axes[1, 2].set_xlabel(f"x ({unit}), turned onto the map before")
+            axes[1, 2].set_xlabel(f"x ({unit}), turned to align with the map before")
     return figure
 
 
 def _draw_differences(axes: Axes, tuning: Tuning) -> None:
     score, threshold = tuning.views[0], tuning.config.view.threshold
-    kinds = (("neighbours in time", score.neighbours, ODOMETRY), ("one place, two times",
-             score.revisits, MAP), ("two places", score.others, LOOP))  # fmt: skip
+    kinds = (("neighbours in time", score.neighbours, ODOMETRY), ("revisits of a place",
+             score.revisits, MAP), ("different places", score.others, LOOP))  # fmt: skip
     top = max(float(values.max()) for _, values, _ in kinds if len(values))
     bins = np.linspace(0.0, top, 60)
     for label, values, colour in kinds:
         if len(values):
             weights = np.full(len(values), 100.0 / len(values))
-            axes.hist(values, bins, weights=weights, histtype="step", lw=1.6, color=colour,
-                      label=label)  # fmt: skip
+            axes.hist(values, bins.tolist(), weights=weights, histtype="step", lw=1.6,
+                      color=colour, label=label)  # fmt: skip
     axes.axvline(threshold, color=INK, ls="--", lw=1.0, label=f"threshold {threshold:g}")
     axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.set(title="How different two views are", xlabel="mean difference of templates (0 to 1)",
-             ylabel="pairs (%)", xlim=(0.0, top))  # fmt: skip
+    axes.set(title="Differences of two templates", xlabel="mean difference (grey levels, 0 to 1)",
+             ylabel="share of pairs (%)", xlim=(0.0, top))  # fmt: skip
     axes.legend()
 
 
 def _draw_templates(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Templates: telling places apart")
+    axes.set_title("Place recognition by single templates")
     if not len(tuning.revisits.same):
-        _say_none(axes, "no place was seen twice")
+        _write_none(axes, "no revisits in this drive")
         return
     axes.set(xlabel="average precision", xlim=(0.0, 1.15))
     axes.set_xticks(np.linspace(0.0, 1.0, 6))
@@ -107,19 +112,20 @@ def _draw_templates(axes: Axes, tuning: Tuning) -> None:
     chosen = next(iter(seen))
     ordered = sorted(seen.items(), key=lambda item: item[1])
     colours = [MAP if label == chosen else "#b9cfe0" for label, _ in ordered]
-    bars = axes.barh(*zip(*ordered, strict=True), height=0.7, color=colours)
+    labels, scores = zip(*ordered, strict=True)
+    bars = axes.barh(labels, scores, height=0.7, color=colours)
     axes.bar_label(bars, fmt="%.3f", padding=2, fontsize=7)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", labelsize=7)
 
 
 def _draw_field_of_view(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Field of view: do loops close?")
+    axes.set_title("Closure of loops in heading")
     motion = tuning.motion
     if motion is None:
-        _say_none(axes, "not told by this drive")
+        _write_none(axes, "not determined by this drive")
         return
-    axes.set(xlabel="horizontal field of view (°)", ylabel="error of the turns of loops, 1 - cos")
+    axes.set(xlabel="horizontal field of view (°)", ylabel="mean of 1 - cos(turn of a loop)")
     axes.plot(motion.tried_deg, motion.error, color=MAP)
     axes.axvline(motion.fov_deg, color=INK, ls="--", lw=1.0, label=f"{motion.fov_deg:.0f}°")
     axes.set_ylim(bottom=0.0)
@@ -127,11 +133,11 @@ def _draw_field_of_view(axes: Axes, tuning: Tuning) -> None:
 
 
 def _draw_maps(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Maps: inconsistency")
+    axes.set_title("Inconsistency of maps")
     if not tuning.trials:
-        _say_none(axes, "no place was seen twice")
+        _write_none(axes, "no revisits in this drive")
         return
-    axes.set(xlabel="threshold of the views", ylabel="distance of revisits / of other pairs")
+    axes.set(xlabel="match threshold of views", ylabel="distance of revisits / of other pairs")
     energies = sorted({trial.config.pose_cells.inject_energy for trial in tuning.trials})
     for energy, colour in zip(energies, (OTHER, MAP, LOOP, ODOMETRY), strict=False):
         some = [t for t in tuning.trials if t.config.pose_cells.inject_energy == energy]
@@ -143,23 +149,27 @@ def _draw_maps(axes: Axes, tuning: Tuning) -> None:
     axes.legend()
 
 
-def _say_none(axes: Axes, why: str) -> None:
+def _write_none(axes: Axes, why: str) -> None:
     axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center")
     axes.set(xticks=[], yticks=[])
 
 
 def _turned(track_xy: np.ndarray, onto_xy: np.ndarray) -> np.ndarray:
-    """Turn a track about its start as it lies best on another of the same frames, if it can be."""
+    """Turn a track to align it with another of the same frames, if they fix a rotation."""
     try:
-        return track_xy @ align(track_xy, onto_xy, "rigid").rotation.T
-    except MapError:  # of other frames, or of a robot that stood still
+        return np.asarray(track_xy @ align(track_xy, onto_xy, "rigid").rotation.T)
+    except MapError:  # other frames, or a robot that stood still
         return track_xy
 
 
-def _draw_track(axes: Axes, trial: Trial, track_xy: np.ndarray, title: str, unit: str) -> None:
+def _counts(trial: Any) -> str:  # noqa: ANN401 - see Tuning
     off = trial.inconsistency
-    told = "" if np.isnan(off) else f", inconsistency {off:.3f}"
-    write_title(axes, title, f"{counted(trial.n_places, 'place')}{told}")
+    score = "" if np.isnan(off) else f", inconsistency {off:.3f}"
+    return f"{counted(trial.n_experiences, 'experience')}{score}"
+
+
+def _draw_track(axes: Axes, counts: str, track_xy: np.ndarray, title: str, unit: str) -> None:
+    write_title(axes, title, counts)
     axes.plot(*track_xy.T, color=MAP, lw=0.6)
     axes.plot(*track_xy[0], "o", color=OTHER, ms=5, label="start")
     axes.plot(*track_xy[-1], "s", color=INK, ms=4, label="end")

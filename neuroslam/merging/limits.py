@@ -7,7 +7,7 @@ import numpy as np
 
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import Tolerance, misfits_m
+from neuroslam.mapping.overlap import Tolerance, pair_residuals_m
 from neuroslam.state.match import Pairs
 
 WINDOW = 3
@@ -48,4 +48,5 @@ def far_off(
     """
     way_m = partial.path_lengths_m(int(pairs.partial[0]))[pairs.partial]
     way_m = way_m + loaded.path_lengths_m(int(pairs.loaded[0]))[pairs.loaded]
-    return misfits_m(pairs, partial.poses, loaded.poses), limits.place_m + limits.drift * way_m
+    residuals_m = pair_residuals_m(pairs, partial.poses, loaded.poses)
+    return residuals_m, limits.place_m + limits.drift * way_m

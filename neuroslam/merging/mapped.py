@@ -6,6 +6,7 @@ from torch import Tensor
 
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.state import answers
 from neuroslam.state.mergeable import Mergeable
 from neuroslam.state.population import Population
 from neuroslam.state.registry import population_classes
@@ -83,5 +84,5 @@ def counts_of(brain: Mapped) -> dict[str, float]:
         "links": brain.map.n_links,
     }
     for population in brain.populations.values():
-        counts |= population.counts()
+        counts |= answers.counts_of(population)
     return counts

@@ -74,7 +74,7 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     merged = ExperienceMap(partial.map.config, partial.map.torus, partial.map.threshold_cells)
     merged.load_state_dict(part_of(state, "map"))
     if not partial.leader.relaxes_map:
-        merged.measure_links()  # a place cell that became another's lies where that does
+        merged.reset_links()  # a place cell that became another's lies where that does
         state |= {f"map.{name}": value for name, value in merged.state_dict().items()}
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded.map, partial, merged, join)

@@ -15,6 +15,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import brain_file
+from neuroslam.state.answers import counts_of
 from neuroslam.state.sessions import Session
 
 
@@ -75,7 +76,7 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
     ]
     for population in brain.populations.values():
-        rows += [_count(name, value) for name, value in population.counts().items()]
+        rows += [_count(name, value) for name, value in counts_of(population).items()]
     return rows
 
 

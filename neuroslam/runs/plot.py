@@ -25,6 +25,7 @@ from neuroslam.runs.reading import (
     trajectory,
     true_poses,
 )
+from neuroslam.state.answers import pictures_of
 from neuroslam.types import PoseEstimate
 
 _TITLE_WIDTH = 90  # letters
@@ -51,7 +52,7 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
             if kind in _DRAWN:
                 figures |= _DRAWN[kind](population, path)
             else:
-                for tag, picture in population.images().items():
+                for tag, picture in pictures_of(population).items():
                     figures[f"{tag.replace('/', '_')}.png"] = plot_activity(picture, tag)
         figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():

@@ -14,6 +14,7 @@ from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import render
 from neuroslam.runs.panels import PANELS, Panels
+from neuroslam.state.answers import pictures_of, scalars_of
 from neuroslam.state.population import Picture
 from neuroslam.types import Frame, StepResult
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from neuroslam.brain.brain import NavigationBrain
 
 _WIDTH = 320  # pixels of a recorded picture: a 60x10 template is too small to see
+_MOST_PIXELS = 1600  # of a side of a coloured picture: a row of many cells is long
 _THUMBNAIL = 48  # pixels of a template's side in the projector, whose sprite must stay small
 
 
@@ -124,7 +126,7 @@ class TensorBoardRecorder(Recorder):
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for population in brain.populations.values():
-                for tag, activity in population.images().items():
+                for tag, activity in pictures_of(population).items():
                     self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
@@ -155,7 +157,7 @@ class TensorBoardRecorder(Recorder):
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
         for population in brain.populations.values():
-            values |= population.scalars()
+            values |= scalars_of(population)
         for panels in self._panels.values():
             panels.write_scalars(result.frame)
         for tag, value in values.items():
@@ -217,7 +219,8 @@ def frame_beside_template(image: np.ndarray, template: np.ndarray | None) -> np.
 def coloured(picture: Picture) -> np.ndarray:
     """Colour the activity of a population: dark is silent, yellow the peak of each layer.
 
-    Every cell is a block of at least 200 / n pixels, n being the smallest side; rows point up.
+    Every cell is a block of at least 200 / n pixels, n being the smallest side, or less where the
+    picture would be wider or higher than 1600; rows point up.
 
     Args:
         picture: Activity ``(h, w)``; a tuple of such layers, which are put side by side; or a
@@ -234,6 +237,7 @@ def coloured(picture: Picture) -> np.ndarray:
     if layers[0].ndim == 3:
         return layers[0]
     block = math.ceil(200 / min(layers[0].shape))
+    block = max(1, min(block, _MOST_PIXELS // max(layers[0].shape)))
     height, width = (side * block for side in layers[0].shape)
     gap, parts = np.full((height, 8, 3), 255, np.uint8), []
     for layer in layers:

@@ -21,6 +21,7 @@ from neuroslam.runs.files import (
 )
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import odometry_track, read_metrics, read_trace, trajectory, true_poses
+from neuroslam.state.answers import counts_of, tables_of
 
 
 @dataclass
@@ -102,8 +103,8 @@ def write_results(
     }
     tables: dict[str, str] = {}
     for population in brain.populations.values():
-        summary.counts |= population.counts()
-        tables |= population.tables()
+        summary.counts |= counts_of(population)
+        tables |= tables_of(population)
     summary.tables = list(tables)
     if truth is not None:
         # A robot that has not moved: nothing tells how to lay its track over the truth.

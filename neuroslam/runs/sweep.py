@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from neuroslam.config import BrainConfig
+from neuroslam.config.populations import section_class
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
@@ -27,7 +28,7 @@ _SEEDS = {
     "place": ("grid_cells.seed",),
     "semantic": ("semantic.seed", "semantic.space.seed"),
 }
-"""Cells -> parameters that are seeds of theirs."""
+"""Kind of a population -> parameters that are its seeds; of others, ``seed`` of their section."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _trial(
         resolve_config(preset, config, tuple(assignments))  # a mistake in these is told as theirs
         raise
     if seed is not None:
-        over = [key for cells in settings.cells for key in _SEEDS.get(cells, ()) if key not in keys]
+        over = [key for kind in settings.cells for key in _seeds_of(kind) if key not in keys]
         settings = resolve_config(None, None, tuple(f"{key}={seed}" for key in over), settings)
         seeded = seeded_spec(source, seed)
         if seeded == source and not over:
@@ -172,6 +173,14 @@ def _trial(
         words += ["seed", str(seed)]
     name = re.sub(r"[^\w.+]+", "-", "-".join(words)).strip("-.")[:80]
     return Trial(f"{number:0{len(str(total))}d}-{name}", source, told, settings)
+
+
+def _seeds_of(kind: str) -> tuple[str, ...]:
+    """Name the seeds of a population."""
+    section = section_class(kind)
+    if section is not None and "seed" in section.model_fields:
+        return (f"{kind}.seed",)
+    return _SEEDS.get(kind, ())
 
 
 def sweep(

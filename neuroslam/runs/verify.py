@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, read_checkpoint
 from neuroslam.config import BrainConfig
-from neuroslam.errors import NeuroslamError, counted, listed
+from neuroslam.errors import NeuroslamError, counted, first_line, listed
 from neuroslam.evaluation.trajectory import read_tum
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.tables import Links
@@ -24,6 +24,7 @@ from neuroslam.runs.files import (
     missing_rows,
 )
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
+from neuroslam.state.answers import tables_of
 from neuroslam.state.mergeable import State
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, session_name
@@ -62,12 +63,15 @@ def verify(path: str | Path) -> list[str]:
         faults.append(f"stored maps are numbered {sorted(numbers)}, expected 0, 1, ...")
     if faults:
         return faults  # nothing else could be looked at
+    try:
+        model.load_state_dict(state)
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        return [f"its state does not fit its config ({first_line(error)})"]
     faults = [f"{where}{fault}" for where, part in parts for fault in _faults(part, config)]
     told = len(state["recognition.tally.alike"])
     if told != len(numbers):
         faults.append(f"recognition: knows of {told} stored maps, there are {len(numbers)}")
     if path.is_dir() and not faults:  # a brain with faults agrees with nothing
-        model.load_state_dict(state)
         faults = list(_folder_faults(path, model))
     return faults
 
@@ -223,7 +227,7 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "links.csv": links_csv(brain.map.links),
     }
     for population in brain.populations.values():
-        expected |= population.tables()
+        expected |= tables_of(population)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:

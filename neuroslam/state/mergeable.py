@@ -168,12 +168,30 @@ def _summed_rows(loaded: Tensor, partial: Tensor, ids: np.ndarray) -> Tensor:
 def rows_of_views(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
     """Keep the loaded rows, then those of partial views that are new; a row for each view.
 
+    Raises:
+        MapError: If a table has more or fewer rows than its session has views.
+
     Example:
         >>> join = Join.nothing()._replace(views=np.array([0, 2]), n_views=2)
         >>> rows_of_views(torch.tensor([5, 6]), torch.tensor([1, 3]), join).tolist()
         [5, 6, 3]
     """
-    return torch.cat([loaded, partial[torch.from_numpy(join.kept_views)].to(loaded)])
+    return _kept_rows(loaded, partial, join.views, join.n_views, "view")
+
+
+def rows_of_experiences(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Keep the loaded rows, then those of partial experiences that are new; one for each."""
+    return _kept_rows(loaded, partial, join.experiences, join.n_experiences, "experience")
+
+
+def _kept_rows(loaded: Tensor, partial: Tensor, ids: np.ndarray, n: int, what: str) -> Tensor:
+    for whose, table, expected in (("loaded", loaded, n), ("partial", partial, len(ids))):
+        if len(table) != expected:  # rows would go to others than they were learnt of
+            raise MapError(
+                f"merge: the {whose} table has {len(table)} rows, expected one for each of "
+                f"{expected} {what}s"
+            )
+    return torch.cat([loaded, partial[torch.from_numpy(np.flatnonzero(ids >= n))].to(loaded)])
 
 
 def renamed(number: Tensor, ids: np.ndarray) -> Tensor:

@@ -1,4 +1,4 @@
-"""Finding the parameters of a video from the video itself, without truth."""
+"""Tuning: the parameters of a video from the video itself, without ground truth."""
 
 from neuroslam.tuning.tune import Tuning, tune
 

@@ -1,4 +1,4 @@
-"""A drive in memory: small grey pictures, and which of them stand for the whole."""
+"""A drive in memory: small grey pictures, and the key frames that tuning compares."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,7 +15,7 @@ from neuroslam.view.preprocess import Encoded
 from neuroslam.view.templates import to_bytes
 
 MAX_FRAMES = 12_000
-"""A longer drive is tuned on its first so many frames."""
+"""Frames that tuning uses, at most; the rest of a longer drive is ignored."""
 
 _WIDTH_PX = 160
 _MAX_KEYS = 1500
@@ -27,12 +27,12 @@ class Drive:
     """The frames of a source that have a picture.
 
     Attributes:
-        frames: With pictures made smaller, grey.
-        factor: How many pixels of the source a pixel has, each way.
+        frames: Frames with pictures reduced in size, grey.
+        factor: Width of a reduced pixel in pixels of the source.
         size: Width and height of the source's pictures, px.
-        unusable: Frames that were left out.
-        views: Templates that a network made of the source's own pictures, by the frames' indices,
-            rounded to bytes; ``None``: templates are of grey.
+        unusable: Number of frames that were left out.
+        views: Templates that a network made from the source's pictures, by frame index, rounded
+            to bytes; ``None`` for grey templates.
     """
 
     frames: list[Frame]
@@ -43,16 +43,31 @@ class Drive:
 
     @property
     def pictures(self) -> np.ndarray:
-        """All pictures, ``uint8``, ``(n, h, w)``."""
-        return np.stack([frame.image for frame in self.frames])
+        """All reduced pictures, ``uint8``, ``(n, h, w)``."""
+        return np.stack([frame.image for frame in self.frames if frame.image is not None])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of a reduced picture."""
+        return self.size[1] // self.factor, self.size[0] // self.factor
 
     def templates(self, keys: np.ndarray) -> np.ndarray:
-        """Return what the network made of some frames, in [0, 1], ``(n, height, width)``."""
-        return np.stack([self.views[self.frames[key].index].template for key in keys]) / 255.0
+        """Return the network's templates of some frames, in [0, 1], ``(n, height, width)``.
+
+        Args:
+            keys: Positions of the frames in ``frames``.
+
+        Raises:
+            ValueError: If the drive was read without a network.
+        """
+        if self.views is None:
+            raise ValueError("Drive.templates: the drive was read without an encoder; give one")
+        views = self.views
+        return np.stack([views[self.frames[key].index].template for key in keys]) / 255.0
 
     @property
     def frame_rate_hz(self) -> float:
-        """Frames per second, on average."""
+        """Mean frame rate."""
         return (len(self.frames) - 1) / (self.frames[-1].time_s - self.frames[0].time_s)
 
     @property
@@ -61,29 +76,35 @@ class Drive:
         return self.frames[-1].velocity is not None
 
     def region(self, left: float, right: float, top: float, bottom: float) -> Region:
-        """Return a part of the small pictures, given as shares of their width and height."""
-        height, width = self.frames[0].image.shape
+        """Return a region of the reduced pictures from fractions of their width and height."""
+        height, width = self.shape
         return (round(left * width), round(right * width), round(top * height),
                 round(bottom * height))  # fmt: skip
 
-    def in_source(self, region: Region | None) -> Region | None:
-        """Return a region of the small pictures in pixels of the source."""
-        return None if region is None else tuple(edge * self.factor for edge in region)
+    def to_source(self, region: Region | None) -> Region | None:
+        """Convert a region of the reduced pictures to pixels of the source."""
+        if region is None:
+            return None
+        x_min, x_max, y_min, y_max = (edge * self.factor for edge in region)
+        return x_min, x_max, y_min, y_max
 
-    def here(self, region: Region | None) -> Region | None:
-        """Return a region of the source's pictures in pixels of the small ones."""
-        return None if region is None else tuple(edge // self.factor for edge in region)
+    def to_reduced(self, region: Region | None) -> Region | None:
+        """Convert a region of the source's pictures to pixels of the reduced ones."""
+        if region is None:
+            return None
+        x_min, x_max, y_min, y_max = (edge // self.factor for edge in region)
+        return x_min, x_max, y_min, y_max
 
 
 def read_drive(
     source: Source, stop: int | None = None, encoder: FeatureEncoder | None = None
 ) -> Drive:
-    """Read a source once and keep its pictures small; frames that cannot be used are left out.
+    """Read a source once and reduce its pictures; unusable frames are left out.
 
     Args:
-        source: Not a live one.
+        source: A recording, not a live source.
         stop: Frame to stop before.
-        encoder: Makes the templates, where they are not of grey.
+        encoder: Network that makes the templates; ``None`` for grey templates.
 
     Raises:
         SourceError: If fewer than a hundred frames have a picture.
@@ -107,18 +128,18 @@ def read_drive(
                 faults.append(fault)
                 continue
             views[frame.index] = view._replace(template=to_bytes(view.template))
-        frames.append(frame._replace(image=_smaller(frame.image, factor)))
+        frames.append(frame._replace(image=_reduced(frame.image, factor)))
         if len(frames) == MAX_FRAMES:
             break
     if len(frames) < _MIN_FRAMES:
         raise SourceError(
             f"{source.name}: {counted(len(frames), 'frame')} with a picture; tuning needs "
-            f"{_MIN_FRAMES} or more, of a drive that comes back to where it was"
+            f"{_MIN_FRAMES} or more, of a drive that revisits places"
         )
     return Drive(frames, factor, size, len(faults), None if encoder is None else views)
 
 
-def _smaller(image: np.ndarray, factor: int) -> np.ndarray:
+def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     height, width = grey.shape[0] // factor, grey.shape[1] // factor
     if factor == 1:
@@ -128,20 +149,22 @@ def _smaller(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def key_frames(drive: Drive) -> np.ndarray:
-    """Choose frames, evenly, among those where the picture changes: standing still tells nothing.
+    """Choose key frames evenly among the frames whose picture differs from the one before.
+
+    Frames of a robot at rest hold no information about its motion.
 
     Returns:
-        Their numbers in the drive, rising; at most 1500.
+        Their positions in the drive, rising; at most 1500.
 
     Raises:
-        SourceError: If the picture hardly ever changes.
+        SourceError: If too few pictures change.
     """
     pictures = drive.pictures
     change = np.array([cv2.absdiff(before, now).mean() for before, now in pairwise(pictures)])
     moving = 1 + np.flatnonzero(change > 0.2 * np.median(change))
     if len(moving) < _MIN_FRAMES // 2:
         raise SourceError(
-            f"only {len(moving)} of {len(pictures)} pictures differ from the one before; tuning "
-            "needs a drive"
+            f"only {len(moving)} of {len(pictures)} pictures differ from the one before, expected "
+            f"{_MIN_FRAMES // 2} or more; tune on a recording of a moving robot"
         )
     return moving[:: -(-len(moving) // _MAX_KEYS)]

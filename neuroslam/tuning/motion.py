@@ -1,12 +1,12 @@
-r"""How wide the camera sees and how fast it goes, told from loops and without truth.
+r"""Field of view and image motion of a camera, estimated from loops without ground truth.
 
-Who comes back to a place, looking as before, has turned by whole turns. So of all fields of view
-:math:`f` that is taken for which the turns :math:`\Delta\theta` of all revisits do this best,
+A robot that revisits a place with the same heading has turned by a multiple of the full turn. The
+estimated field of view :math:`f` is the one for which the turns of all revisits agree best,
 
 .. math:: \min_f \; \operatorname{mean} \bigl(1 - \cos(f\, \Delta s / w)\bigr)
 
-with :math:`\Delta s` the pixels that the picture moved sideways in between, and :math:`w` its
-width. One camera cannot tell metres: speeds are scaled so that a view lasts as long as a place.
+with :math:`\Delta s` the horizontal image shift in between, in pixels, and :math:`w` the width of
+the picture.
 """
 
 from itertools import pairwise
@@ -20,16 +20,16 @@ from neuroslam.odometry.visual import column_sums, match_profiles
 
 FIELDS_OF_VIEW_DEG = np.arange(40.0, 181.0, 1.0)
 
-_AS_GOOD = 0.05
+_ERROR_MARGIN = 0.05
 
 
 class Shifts(NamedTuple):
-    """What visual odometry measures in a region, before it is scaled.
+    """Unscaled measurements of visual odometry in a region of the picture.
 
     Attributes:
         region: ``x_min, x_max, y_min, y_max`` in px.
-        shift_px: Offset to the picture before, ``(n,)``; the first is 0.
-        difference: Smallest difference there, grey in [0, 1], ``(n,)``; the first is 0.
+        shift_px: Horizontal offset to the picture before, ``(n,)``; the first is 0.
+        difference: Mean difference at that offset, grey in [0, 1], ``(n,)``; the first is 0.
     """
 
     region: Region
@@ -38,12 +38,12 @@ class Shifts(NamedTuple):
 
 
 class FieldOfView(NamedTuple):
-    r"""A field of view and how well the turns of loops agree with it.
+    r"""An estimated field of view and the error of all candidates.
 
     Attributes:
-        fov_deg: The best.
+        fov_deg: The estimate.
         error: Mean of :math:`1 - \cos` of the turns, for each of ``tried_deg``.
-        shifts: The region it was measured in.
+        shifts: The image shifts that it was estimated from.
     """
 
     fov_deg: float
@@ -52,7 +52,7 @@ class FieldOfView(NamedTuple):
 
     @property
     def tried_deg(self) -> np.ndarray:
-        """The fields of view that were compared."""
+        """The candidate fields of view."""
         return FIELDS_OF_VIEW_DEG
 
 
@@ -60,9 +60,9 @@ def measure_shifts(pictures: np.ndarray, region: Region, max_shift: int) -> Shif
     """Match each picture with the one before it, as visual odometry does.
 
     Args:
-        pictures: In order, grey ``uint8``, ``(n, h, w)``.
-        region: Part of them that is looked at.
-        max_shift: Offsets tried, px.
+        pictures: In order of time, grey ``uint8``, ``(n, h, w)``.
+        region: Region of the pictures that is matched.
+        max_shift: Largest offset, px.
     """
     sums = [column_sums(picture, region) for picture in pictures]
     pairs = [match_profiles(b, a, max_shift) for a, b in pairwise(sums)]
@@ -71,24 +71,24 @@ def measure_shifts(pictures: np.ndarray, region: Region, max_shift: int) -> Shif
 
 
 def field_of_view(shifts: Shifts, width: int, revisits: np.ndarray) -> FieldOfView | None:
-    """Find the field of view for which loops close in heading.
+    """Estimate the field of view for which loops close in heading.
 
     Args:
-        shifts: Of the whole drive.
-        width: Of the pictures, px.
-        revisits: Pairs of frames that show one place, ``(m, 2)``.
+        shifts: Image shifts of the whole drive.
+        width: Width of the pictures, px.
+        revisits: Pairs of frames that show the same place, ``(m, 2)``.
 
     Returns:
-        The smallest of the best; ``None`` if loops hold no turn to tell it from.
+        The smallest of the best candidates; ``None`` if the loops hold too little turning.
     """
     turned = np.cumsum(shifts.shift_px) / width
     turned = turned[revisits[:, 1]] - turned[revisits[:, 0]]
     turns = np.outer(np.deg2rad(FIELDS_OF_VIEW_DEG), turned)
     error = (1.0 - np.cos(turns)).mean(axis=1)
-    if np.abs(turns).mean() < 1.0:  # a figure of eight: any field of view closes it
+    if np.abs(turns).mean() < 1.0:  # a figure of eight closes for any field of view
         return None
     smooth = cv2.blur(error[:, None], (1, 5), borderType=cv2.BORDER_REPLICATE)[:, 0]
-    # Twice the true one would turn every lap by two whole turns: the first good one is the true.
-    first = int(np.argmax(smooth <= smooth.min() + _AS_GOOD))
-    valley = first + int(np.argmax(np.diff(smooth[first:], append=np.inf) >= 0.0))
-    return FieldOfView(float(FIELDS_OF_VIEW_DEG[valley]), error, shifts)
+    # Twice the true field of view gives two full turns per lap, so the first minimum is right.
+    first = int(np.argmax(smooth <= smooth.min() + _ERROR_MARGIN))
+    minimum = first + int(np.argmax(np.diff(smooth[first:], append=np.inf) >= 0.0))
+    return FieldOfView(float(FIELDS_OF_VIEW_DEG[minimum]), error, shifts)

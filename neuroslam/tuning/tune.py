@@ -1,4 +1,4 @@
-"""From a video to the parameters it needs: views first, then motion, then the map as a whole."""
+"""Find the parameters of a video: views first, then motion, then the map as a whole."""
 
 import json
 import math
@@ -22,15 +22,15 @@ from neuroslam.state.registry import leading_class
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
-from neuroslam.tuning.search import Trial, best_of, drive_through, judge, level_with
+from neuroslam.tuning.search import Trial, best_of, consistency_limit, map_frames, score_map
 from neuroslam.tuning.views import ViewScore, best_view, score_views
 from neuroslam.view.features import FeatureEncoder
 
-FEW_REVISITS = 30
-"""Revisits below which a drive tells too little about its loops to search by them."""
+MIN_REVISITS = 30
+"""Fewest revisits for a search: below, a drive holds too little information about its loops."""
 
-CONTRADICTED = 0.5
-"""Inconsistency from which on no map agrees with the revisits: they were none."""
+MAX_INCONSISTENCY = 0.5
+"""Inconsistency of the best map above which the revisits are taken for false matches."""
 
 _SIZES = ((60, 10), (40, 15), (32, 24), (20, 10))
 _BANDS = ((0.0, 0.5), (0.0, 2 / 3), (1 / 6, 2 / 3), (1 / 3, 1.0))
@@ -42,18 +42,18 @@ _THRESHOLDS = 7
 
 @dataclass
 class Tuning:
-    """What tuning found.
+    """The result of tuning.
 
     Attributes:
-        config: The config to map with.
-        changes: Key -> value before, value found, and why, for each parameter looked at.
-        notes: What the user should know.
-        revisits: Which key frames show one place.
-        keys: Numbers of the key frames among the frames with a picture.
-        views: The templates that were compared; the one chosen first.
-        motion: Field of view, and the error of the others; ``None``: loops do not tell.
+        config: The config found.
+        changes: Key -> value before, value found, and reason, for each parameter tuned.
+        notes: Messages for the user.
+        revisits: Pairs of key frames that show the same place.
+        keys: Positions of the key frames among the frames with a picture.
+        views: Scores of the templates compared; the chosen one first.
+        motion: The field of view; ``None`` where the loops do not determine it.
         trials: The maps of the search.
-        before: The map of the config that tuning began with.
+        before: The map of the config that tuning started from.
         after: The map of the config found.
     """
 
@@ -70,21 +70,21 @@ class Tuning:
 
     @property
     def verdict(self) -> str:
-        """Whether the config found is worth taking, in words."""
+        """Whether to use the config found, in words."""
         old, new = self.before, self.after
         if old is None or new is None or not new.inconsistency >= 0.0:  # NaN: not known
-            return "not known to be better: the drive does not tell"
-        fewer = old.n_places - new.n_places
+            return "not known to be better: the drive has no revisits to measure it"
+        fewer = old.n_experiences - new.n_experiences
         more = "fewer" if fewer > 0 else "more"
-        size = f"{counted(abs(fewer), 'place')} {more}" if fewer else "as large"
-        if new.inconsistency > level_with(old.inconsistency):
-            return f"less consistent than before, {size}: keep what you had"
-        if old.inconsistency <= level_with(new.inconsistency):
+        size = f"{counted(abs(fewer), 'experience')} {more}" if fewer else "same size"
+        if new.inconsistency > consistency_limit(old.inconsistency):
+            return f"less consistent than before, {size}: keep the config you had"
+        if old.inconsistency <= consistency_limit(new.inconsistency):
             return f"about as consistent as before, {size}"
-        return f"more consistent than before, {size}: take it"
+        return f"more consistent than before, {size}: use the config found"
 
     def to_dict(self) -> dict[str, Any]:
-        """Name every figure: the content of ``tune.json``."""
+        """Return the content of ``tune.json``."""
         return {
             "verdict": self.verdict,
             "revisits": len(self.revisits.same),
@@ -105,19 +105,21 @@ class Tuning:
                 }
                 for score in self.views
             ],
-            "maps": [_told(trial) for trial in self.trials],
-            "before": _told(self.before),
-            "after": _told(self.after),
+            "maps": [_trial_to_dict(trial) for trial in self.trials],
+            "before": _trial_to_dict(self.before),
+            "after": _trial_to_dict(self.after),
         }
 
 
-def _told(trial: Trial) -> dict[str, Any]:
+def _trial_to_dict(trial: Trial | None) -> dict[str, Any] | None:
+    if trial is None:
+        return None
     return {
         "threshold": trial.config.view.threshold,
         "inject_energy": trial.config.pose_cells.inject_energy,
         "inconsistency": None if math.isnan(trial.inconsistency) else trial.inconsistency,
-        "templates": trial.n_views,
-        "experiences": trial.n_places,
+        "templates": trial.n_templates,
+        "experiences": trial.n_experiences,
         "links": trial.n_links,
     }
 
@@ -134,19 +136,19 @@ def tune(
 ) -> Tuning:
     """Find crop, template, threshold, field of view, speed and injection for a source's pictures.
 
-    No truth is needed. Revisits are found in sequences of pictures, the template is the one that
-    tells them from other places by single pictures, turns and their scale are such that loops
-    close, and threshold and injection are those of the most consistent map.
+    Tuning needs no ground truth. Revisits come from sequences of pictures. The template chosen
+    separates them best from other places by single pictures, the field of view is the one for
+    which loops close in heading, and threshold and injection give the most consistent map.
 
     Args:
-        source: Anything with pictures that :func:`neuroslam.sensors.open_source` opens.
+        source: Any source with pictures that :func:`neuroslam.sensors.open_source` opens.
         out: Folder to write: ``config.toml``, ``tune.json``, ``tune.png``.
-        config: What is not tuned is taken from it; the defaults if not given.
-        stop: Frame to stop before; at most 12 000 frames are looked at.
+        config: Config to start from, which gives all that is not tuned; ``None``: the defaults.
+        stop: Frame to stop before; tuning reads at most 12 000 frames.
         overwrite: Replace an earlier tuning in ``out``.
-        on_stage: Called with what is being done.
-        features: Network that makes views, where ``config.view.features`` is ``"module"``. Of a
-            network, crop and size of the template stay as they are.
+        on_stage: Called with the name of each stage when it begins.
+        features: Network that makes views, where ``config.view.features`` is ``"module"``. Crop
+            and template size of a network are not tuned.
 
     Raises:
         SourceError: If the source cannot be read, or has fewer than a hundred pictures.
@@ -154,7 +156,10 @@ def tune(
     """
     out, config = Path(out), config or BrainConfig()
     if not leading_class(config).needs_views:
-        raise RunError(f"cells are {'+'.join(config.cells)}; tuning is of views, which needs pose")
+        raise RunError(
+            f"cells are {'+'.join(config.cells)}, expected pose: tuning is for brains that match "
+            "views"
+        )
     if stop is not None and stop < 1:
         raise RunError(f"stop is {stop}; expected 1 or more")
     if out.exists() and not out.is_dir():
@@ -163,10 +168,12 @@ def tune(
         raise RunError(f"{out}: holds a config.toml already; take another folder or --overwrite")
     opened = open_source(source, config.frame_rate_hz)
     if opened.live:
-        raise RunError(f"{opened.name}: is live; tuning looks several times, so tune a recording")
-    tell = on_stage or (lambda stage: None)
+        raise RunError(
+            f"{opened.name}: is live; tuning reads its source several times, so tune on a recording"
+        )
+    report = on_stage or (lambda stage: None)
     with one_thread():
-        tuning = _tune(opened, config, stop, tell, features)
+        tuning = _tune(opened, config, stop, report, features)
         figure = plot_tuning(tuning, opened.name)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -182,59 +189,59 @@ def _tune(
     source: Source,
     config: BrainConfig,
     stop: int | None,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     features: nn.Module | None,
 ) -> Tuning:
-    tell("reading")
+    report("reading")
     encoder = None if config.view.features == "grey" else FeatureEncoder(config.view, features)
     drive = read_drive(source, stop, encoder)
     keys = key_frames(drive)
-    tell("looking for places seen twice")
+    report("finding revisits")
     revisits = find_revisits(drive.pictures[keys])
     tuning = Tuning(config, revisits, keys)
-    if len(revisits.same) >= FEW_REVISITS:
-        _search(tuning, drive, tell)
-    if not tuning.trials or best_of(tuning.trials).inconsistency > CONTRADICTED:
+    if len(revisits.same) >= MIN_REVISITS:
+        _search(tuning, drive, report)
+    if not tuning.trials or best_of(tuning.trials).inconsistency > MAX_INCONSISTENCY:
         tuning = _without_loops(tuning, config, drive)
     if drive.unusable:
-        tuning.notes.append(f"{drive.unusable} frames could not be used and were left out")
-    tell("mapping with what was found")
+        tuning.notes.append(f"{counted(drive.unusable, 'frame')} could not be used, left out")
+    report("mapping with the config found")
     _compare(tuning, source, drive, config)
     return tuning
 
 
-def _search(tuning: Tuning, drive: Drive, tell: Callable[[str], None]) -> None:
-    tell("choosing the template")
+def _search(tuning: Tuning, drive: Drive, report: Callable[[str], None]) -> None:
+    report("choosing the template")
     _choose_view(tuning, drive, search=True)
-    tell("measuring turns and speed")
+    report("measuring turns and speed")
     _choose_motion(tuning, drive, search=True)
-    tell("making maps")
+    report("comparing maps")
     _choose_threshold(tuning, drive)
 
 
 def _without_loops(tried: Tuning, config: BrainConfig, drive: Drive) -> Tuning:
-    """Tune what can be where no place was seen twice."""
+    """Tune what does not need revisits."""
     n = len(tried.revisits.same)
     none = tried.revisits._replace(same=np.empty((0, 2), int))
     tuning = Tuning(config, none, tried.keys)
     _choose_view(tuning, drive, search=False)
     _choose_motion(tuning, drive, search=False)
-    why = "none of the maps agrees that they do" if tried.trials else "too few to go by"
+    why = "but no map agrees with them" if tried.trials else f"of at least {MIN_REVISITS} needed"
     tuning.notes.append(
-        f"{n} of {len(tried.keys)} key frames seem to show a place seen before, {why}: crop, "
-        "template, field of view and injection are as they were; drive the same way twice"
+        f"{n} of {len(tried.keys)} key frames seem to revisit a place, {why}: crop, template, "
+        "field of view and injection are unchanged; drive the same route twice"
     )
     return tuning
 
 
 def _set(tuning: Tuning, section: str, why: str, **values: object) -> None:
-    """Change keys of a section, and remember what they were."""
-    now = getattr(tuning.config, section)
+    """Change keys of a section, and record their values before."""
+    current = getattr(tuning.config, section)
     for key, value in values.items():
         name = f"{section}.{key}"
-        before = tuning.changes.get(name, (getattr(now, key),))[0]
+        before = tuning.changes.get(name, (getattr(current, key),))[0]
         tuning.changes[name] = (before, value, why)
-    tuning.config = tuning.config.model_copy(update={section: now.model_copy(update=values)})
+    tuning.config = tuning.config.model_copy(update={section: current.model_copy(update=values)})
 
 
 def _choose_view(tuning: Tuning, drive: Drive, search: bool) -> None:
@@ -242,45 +249,46 @@ def _choose_view(tuning: Tuning, drive: Drive, search: bool) -> None:
         _choose_template(tuning, drive, search)
     else:
         templates = drive.templates(tuning.keys)
-        grey = fitting(ViewConfig(), drive.frames[0].image.shape)  # for comparison
+        grey = fitting(ViewConfig(), drive.shape)  # for comparison
         tuning.views = [
             score_views(templates, tuning.config.view, tuning.revisits),
             *best_view(drive.pictures[tuning.keys], [grey], tuning.revisits),
         ]
     chosen = tuning.views[0]
-    alike, unlike = np.median(chosen.neighbours), np.quantile(chosen.others, 0.05)
-    _set(tuning, "view", "between neighbours and far frames",
-         threshold=_rounded(max(0.005, math.sqrt(alike * unlike))))  # fmt: skip
+    near, far = np.median(chosen.neighbours), np.quantile(chosen.others, 0.05)
+    _set(tuning, "view", "between the differences of neighbours and of far frames",
+         threshold=_rounded(max(0.005, math.sqrt(near * far))))  # fmt: skip
 
 
 def _choose_template(tuning: Tuning, drive: Drive, search: bool) -> None:
-    """Choose what tells places best apart in pictures of grey."""
+    """Choose the grey template that separates places best."""
     pictures = drive.pictures[tuning.keys]
-    now = tuning.config.view
-    now = fitting(now.model_copy(update={"crop": drive.here(now.crop)}), pictures[0].shape)
+    best = tuning.config.view
+    best = fitting(best.model_copy(update={"crop": drive.to_reduced(best.crop)}), drive.shape)
     if search:
-        for options in (
+        stages: tuple[list[dict[str, Any]], ...] = (
             [{"crop": None}, *({"crop": drive.region(0, 1, *band)} for band in _BANDS)],
             [{"template_width": width, "template_height": height} for width, height in _SIZES],
             [{"patch_radius": radius} for radius in _PATCHES],
-        ):
-            scored = best_view(pictures, _usable(now, options, pictures[0].shape), tuning.revisits)
+        )
+        for options in stages:
+            scored = best_view(pictures, _usable(best, options, drive.shape), tuning.revisits)
             tuning.views = scored + tuning.views
-            now = scored[0].config
-        _set(tuning, "view", "best tells places apart",
-             crop=drive.in_source(now.crop), template_width=now.template_width,
-             template_height=now.template_height, patch_radius=now.patch_radius)  # fmt: skip
+            best = scored[0].config
+        _set(tuning, "view", "separates places best",
+             crop=drive.to_source(best.crop), template_width=best.template_width,
+             template_height=best.template_height, patch_radius=best.patch_radius)  # fmt: skip
     else:
-        tuning.views = best_view(pictures, [now], tuning.revisits)
+        tuning.views = best_view(pictures, [best], tuning.revisits)
 
 
 def _usable(
-    now: ViewConfig, options: list[dict[str, Any]], shape: tuple[int, ...]
+    current: ViewConfig, options: list[dict[str, Any]], shape: tuple[int, ...]
 ) -> list[ViewConfig]:
-    """Return the config as it is and with each option whose template fits into its crop."""
-    configs = [now]
+    """Return the current config, and it with each option whose template fits into its crop."""
+    configs = [current]
     for option in options:
-        config = now.model_copy(update=option)
+        config = current.model_copy(update=option)
         x_min, x_max, y_min, y_max = config.crop or (0, shape[1], 0, shape[0])
         fits = config.template_width <= x_max - x_min and config.template_height <= y_max - y_min
         if fits and config not in configs and 2 * config.shift_match < config.template_width:
@@ -290,7 +298,7 @@ def _usable(
 
 def _choose_motion(tuning: Tuning, drive: Drive, search: bool) -> None:
     if drive.has_motion and tuning.config.odometry.use != "visual":
-        tuning.notes.append("the source measures its motion itself: odometry is as it was")
+        tuning.notes.append("the source measures its motion itself: odometry is unchanged")
         return
     pictures = drive.pictures
     width = pictures.shape[2]
@@ -300,31 +308,31 @@ def _choose_motion(tuning: Tuning, drive: Drive, search: bool) -> None:
         regions = [drive.region(0, 1, top, bottom) for top, bottom in _TURN_BANDS]
         measured = [measure_shifts(pictures, region, max_shift) for region in regions]
         fields = [field_of_view(shifts, width, pairs) for shifts in measured]
-        fields = [one for one in fields if one is not None]
-        tuning.motion = min(fields, key=lambda one: round(float(one.error.min()), 2), default=None)
-        if tuning.motion is not None and tuning.motion.error.min() > 0.5:
-            tuning.motion = None
-        if tuning.motion is None:
-            tuning.notes.append("the loops do not tell the field of view: it is as it was")
+        found = [one for one in fields if one is not None]
+        best = min(found, key=lambda one: round(float(one.error.min()), 2), default=None)
+        if best is None or best.error.min() > 0.5:
+            tuning.notes.append("the loops do not determine the field of view: it is unchanged")
         else:
-            _set(tuning, "odometry", "loops close in heading", fov_deg=tuning.motion.fov_deg,
-                 turn_region=drive.in_source(tuning.motion.shifts.region))  # fmt: skip
+            tuning.motion = best
+            _set(tuning, "odometry", "loops close in heading", fov_deg=best.fov_deg,
+                 turn_region=drive.to_source(best.shifts.region))  # fmt: skip
     speed = measure_shifts(pictures, drive.region(0, 1, 0.5, 1.0), max_shift).difference
     typical = float(np.median(speed[speed > 0.2 * np.median(speed)]))
-    lasting_s = _lasting_s(tuning, drive)
+    duration_s = _view_duration_s(tuning, drive)
     cells = tuning.config.pose_cells
-    scale = cells.create_threshold_cells * cells.cell_size_m / lasting_s / max(typical, 1e-6)
-    _set(tuning, "odometry", f"a view lasts {lasting_s:.2g} s, and so a place",
+    # A camera has no metric scale: a view lasts as long as the robot needs for a new experience.
+    scale = cells.create_threshold_cells * cells.cell_size_m / duration_s / max(typical, 1e-6)
+    _set(tuning, "odometry", f"a view lasts {duration_s:.2g} s, as long as an experience",
          speed_scaling_m_s=_rounded(scale), max_speed_m_s=_rounded(4.0 * scale * typical),
          min_speed_m_s=_rounded(0.05 * scale * typical),
          max_shift_px=max_shift * drive.factor)  # fmt: skip
 
 
-def _lasting_s(tuning: Tuning, drive: Drive) -> float:
-    """Return how long a view is seen, at the threshold, in seconds."""
+def _view_duration_s(tuning: Tuning, drive: Drive) -> float:
+    """Return how long a view matches, at the threshold, in seconds."""
     times = np.array([drive.frames[key].time_s for key in tuning.keys])
-    apart = np.diff(times)
-    return float(np.median(apart)) * tuning.views[0].lasts(tuning.config.view.threshold)
+    interval_s = float(np.median(np.diff(times)))
+    return interval_s * tuning.views[0].lasts(tuning.config.view.threshold)
 
 
 def _choose_threshold(tuning: Tuning, drive: Drive) -> None:
@@ -341,8 +349,8 @@ def _choose_threshold(tuning: Tuning, drive: Drive) -> None:
                 "pose_cells": tuning.config.pose_cells.model_copy(update={"inject_energy": energy}),
             }
         )
-        brain, places = drive_through(_on_small(config, drive), drive.frames, drive.views)
-        return judge(config, brain, places, keys, tuning.revisits)
+        brain, experiences = map_frames(_on_reduced(config, drive), drive.frames, drive.views)
+        return score_map(config, brain, experiences, keys, tuning.revisits)
 
     energy = tuning.config.pose_cells.inject_energy
     thresholds = [_rounded(t) for t in np.geomspace(low, high, _THRESHOLDS)]
@@ -353,40 +361,40 @@ def _choose_threshold(tuning: Tuning, drive: Drive) -> None:
     better = min(others, key=lambda trial: trial.inconsistency)
     if better.inconsistency < 0.9 * best.inconsistency:
         best = better
-    why = "smallest of the consistent maps"
+    why = "smallest map among the consistent ones"
     _set(tuning, "view", why, threshold=best.config.view.threshold)
     _set(tuning, "pose_cells", why, inject_energy=best.config.pose_cells.inject_energy)
 
 
-def _on_small(config: BrainConfig, drive: Drive) -> BrainConfig:
-    """Return the config for the small pictures."""
+def _on_reduced(config: BrainConfig, drive: Drive) -> BrainConfig:
+    """Return the config for the reduced pictures."""
     odometry, view = config.odometry, config.view
     return config.model_copy(
         update={
             "odometry": odometry.model_copy(
                 update={
-                    "speed_region": drive.here(odometry.speed_region),
-                    "turn_region": drive.here(odometry.turn_region),
+                    "speed_region": drive.to_reduced(odometry.speed_region),
+                    "turn_region": drive.to_reduced(odometry.turn_region),
                     "max_shift_px": max(1, odometry.max_shift_px // drive.factor),
                 }
             ),
-            "view": view.model_copy(update={"crop": drive.here(view.crop)}),
+            "view": view.model_copy(update={"crop": drive.to_reduced(view.crop)}),
         }
     )
 
 
 def _compare(tuning: Tuning, source: Source, drive: Drive, before: BrainConfig) -> None:
-    """Map the source itself, not the small pictures, with the config before and the one found."""
+    """Map the source itself, not the reduced pictures, with the config before and after."""
     keys = np.array([drive.frames[key].index for key in tuning.keys])
     last = drive.frames[-1].index + 1
     maps = []
     for config in (before, tuning.config):
         frames = source.frames(stop=last, on_bad_frame=lambda fault: None)
-        brain, places = drive_through(config, frames, drive.views)
-        maps.append(judge(config, brain, places, keys, tuning.revisits))
+        brain, experiences = map_frames(config, frames, drive.views)
+        maps.append(score_map(config, brain, experiences, keys, tuning.revisits))
     tuning.before, tuning.after = maps
 
 
 def _rounded(value: float) -> float:
-    """Three digits: more say nothing, and are tiresome to read."""
+    """Round to three digits, the accuracy of tuning."""
     return float(f"{value:.3g}")

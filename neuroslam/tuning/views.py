@@ -1,4 +1,4 @@
-"""Which template tells places apart in these pictures, and how near two views of one place are."""
+"""Scores of templates: how well they separate places, and differences within a place."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -6,25 +6,25 @@ from typing import NamedTuple
 import numpy as np
 
 from neuroslam.config import ViewConfig
-from neuroslam.tuning.revisits import Revisits, pairwise
+from neuroslam.tuning.revisits import Revisits, pairwise_differences
 from neuroslam.view.preprocess import encode
 
 _LAGS = 200
 
 
 class ViewScore(NamedTuple):
-    """How well single views tell places apart.
+    """Place recognition by single templates.
 
     Attributes:
-        config: Of the template.
-        precision: Of recognising each key frame among all earlier ones, ``(n,)``, the surest first.
-        recall: Share of the revisits that are recognised until there, ``(n,)``.
-        threshold: Difference up to there, ``(n,)``.
+        config: Config of the template.
+        precision: Share of correct matches of key frames up to a threshold, ``(n,)``.
+        recall: Share of the revisits that are matched up to it, ``(n,)``.
+        threshold: Rising thresholds on the difference, ``(n,)``.
         average_precision: Area below precision over recall.
-        neighbours: Differences of key frames in a row, ``(m,)``.
-        revisits: Of two views of one place, ``(m,)``.
-        others: Of two views of two places, ``(m,)``.
-        growth: Median difference of key frames, by how many they are apart, from 1 on.
+        neighbours: Differences of successive key frames, ``(m,)``.
+        revisits: Differences of two views of the same place, ``(m,)``.
+        others: Differences of views of two places, ``(m,)``.
+        growth: Median difference of key frames by their distance in key frames, from 1.
     """
 
     config: ViewConfig
@@ -38,30 +38,30 @@ class ViewScore(NamedTuple):
     growth: np.ndarray
 
     def lasts(self, threshold: float) -> int:
-        """Return for how many key frames a view is below a difference, 1 or more."""
+        """Return for how many key frames the difference to a view stays below a threshold."""
         beyond = np.flatnonzero(self.growth > threshold)
         return 1 + int(beyond[0]) if len(beyond) else len(self.growth)
 
 
 def score_views(templates: np.ndarray, config: ViewConfig, revisits: Revisits) -> ViewScore:
-    """Recognise each key frame among all others and compare with what stretches say.
+    """Match each key frame with all others and compare with the revisits found by sequences.
 
     Args:
-        templates: Of the key frames, in [0, 1], ``(n, template_height, template_width)``.
-        config: Of the templates; its threshold is not used.
-        revisits: Which key frames show one place.
+        templates: Templates of the key frames, in [0, 1], ``(n, height, width)``.
+        config: Config of the templates; its threshold is not used.
+        revisits: Pairs of key frames that show the same place.
     """
-    apart = pairwise(templates, config.shift_match)
-    n, near = len(apart), revisits.near
+    differences = pairwise_differences(templates, config.shift_match)
+    n, near = len(differences), revisits.near
     known = near.any(axis=1)
     far = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) >= revisits.gap
-    nearest = np.where(far, apart, np.inf).argmin(axis=1)
-    smallest = np.where(far, apart, np.inf)[np.arange(n), nearest]
-    right = near[np.arange(n), nearest]
+    nearest = np.where(far, differences, np.inf).argmin(axis=1)
+    smallest = np.where(far, differences, np.inf)[np.arange(n), nearest]
+    correct = near[np.arange(n), nearest]
     order = np.argsort(smallest, kind="stable")
-    sure = np.isfinite(smallest) & ~revisits.unsure[np.arange(n), nearest]
-    order = order[sure[order]]
-    hits = np.cumsum(right[order])
+    certain = np.isfinite(smallest) & ~revisits.unsure[np.arange(n), nearest]
+    order = order[certain[order]]
+    hits = np.cumsum(correct[order])
     precision = hits / np.arange(1, len(order) + 1)
     recall = hits / max(1, int(known.sum()))
     gained = np.diff(recall, prepend=0.0)
@@ -71,22 +71,22 @@ def score_views(templates: np.ndarray, config: ViewConfig, revisits: Revisits) -
         recall,
         smallest[order],
         float((precision * gained).sum()),
-        np.diagonal(apart, 1).copy(),
-        apart[revisits.same[:, 0], revisits.same[:, 1]],
-        apart[revisits.other[:, 0], revisits.other[:, 1]],
-        np.array([np.median(np.diagonal(apart, lag)) for lag in range(1, min(n, _LAGS))]),
+        np.diagonal(differences, 1).copy(),
+        differences[revisits.same[:, 0], revisits.same[:, 1]],
+        differences[revisits.other[:, 0], revisits.other[:, 1]],
+        np.array([np.median(np.diagonal(differences, lag)) for lag in range(1, min(n, _LAGS))]),
     )
 
 
 def best_view(
     pictures: np.ndarray, configs: Iterable[ViewConfig], revisits: Revisits
 ) -> list[ViewScore]:
-    """Score templates of grey, the best first; of equals the one given first.
+    """Score grey templates of several configs, best first; equal scores keep their order.
 
     Args:
         pictures: Key frames, as for :func:`~neuroslam.tuning.revisits.find_revisits`.
-        configs: Of the templates.
-        revisits: Which key frames show one place.
+        configs: Configs of the templates.
+        revisits: Pairs of key frames that show the same place.
     """
     scores = [
         score_views(np.stack([encode(p, config).template for p in pictures]), config, revisits)

@@ -1,4 +1,4 @@
-"""All surfaces of a world in one picture, at halving resolutions, so that one lookup draws a frame.
+"""All surfaces of a world in one image, at halving resolutions, so that one lookup draws a frame.
 
 Far walls cover many of their own pixels per pixel of the frame; looked up one by one they would
 flicker. So a wall is kept at every pair of (horizontal, vertical) halvings, averaged beforehand
@@ -17,7 +17,7 @@ _PAD = 2
 
 
 class Atlas:
-    """Packs pictures on shelves of one image.
+    """Packs images on shelves of one image.
 
     Attributes:
         image: ``uint8 (h, w, 3)``.
@@ -67,7 +67,7 @@ class Atlas:
 
 
 def halvings(image: np.ndarray) -> list[np.ndarray]:
-    """Return a picture at full, half, quarter ... size, down to four pixels."""
+    """Return an image at full, half, quarter ... size, down to four pixels."""
     levels = 1
     while min(image.shape[:2]) >> levels >= 4:
         levels += 1

@@ -57,7 +57,7 @@ class Canvas:
         return round(x * self.per_m), round((self.height_m - z) * self.per_m)
 
     def part(self, x0: float, z0: float, x1: float, z1: float) -> np.ndarray:
-        """Return a writable view of a rectangle of the picture (cut at its borders)."""
+        """Return a writable view of a rectangle of the image (cut at its borders)."""
         (left, bottom), (right, top) = self.px(x0, z0), self.px(x1, z1)
         return self.image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
 
@@ -92,7 +92,7 @@ class Canvas:
 
 
 def shade(part: np.ndarray, factor: np.ndarray | float) -> None:
-    """Multiply a piece of a picture by a factor ``(h, w)`` or a number, in place."""
+    """Multiply a piece of an image by a factor ``(h, w)`` or a number, in place."""
     if isinstance(factor, np.ndarray) and factor.ndim == 2:
         factor = factor[..., None]
     part[:] = np.clip(part * factor, 0, 255).astype(np.uint8)

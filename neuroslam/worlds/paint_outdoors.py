@@ -257,7 +257,7 @@ def _around(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, flo
 
 
 def _cut(image: np.ndarray) -> np.ndarray:
-    """Return a painted RGBA picture, drawn at double size, at its size."""
+    """Return a painted RGBA image, drawn at double size, at its size."""
     return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from neuroslam.geometry import TWO_PI
-from neuroslam.sensors.markers import marker_dictionary, marker_picture
+from neuroslam.sensors.markers import marker_dictionary, marker_image
 from neuroslam.types import Pose
 from neuroslam.worlds.render import cast
 from neuroslam.worlds.scene import Billboard, World
@@ -58,7 +58,7 @@ def _post(dictionary: str, number: int, size_m: float, eye_m: float) -> np.ndarr
     middle = width // 2
     image[width:, middle - _MODULE_PX // 2 : middle + _MODULE_PX // 2] = (96, 96, 96, 255)
     image[:width] = 255
-    black = marker_picture(dictionary, number, side)
+    black = marker_image(dictionary, number, side)
     image[margin : margin + side, margin : margin + side, :3] = black[..., None]
     return image
 

@@ -21,7 +21,7 @@ _FINE = 2  # rows drawn per row delivered: slanted edges become smooth
 
 @dataclass(frozen=True)
 class Camera:
-    """A level camera. Forward is the middle column; the left half of the picture is to the left.
+    """A level camera. Forward is the middle column; the left half of the image is to the left.
 
     A point at ``depth`` along a column's ray and ``z`` above the camera is seen ``focal_px * z /
     depth`` pixels above the horizon. Pinhole: depth is along the axis, columns are equally wide on
@@ -72,7 +72,7 @@ class Camera:
 class Hits(NamedTuple):
     """What each column's ray meets, each of shape ``(width,)``.
 
-    ``depth`` in units of the ray; ``strip`` which picture; ``along_m`` where on it; ``slant`` the
+    ``depth`` in units of the ray; ``strip`` which image; ``along_m`` where on it; ``slant`` the
     sine of the angle between ray and surface times the ray's length; ``top_m`` height of the thing.
     """
 
@@ -349,13 +349,13 @@ def _blend(
 
     levels = world.figure_levels[figure.cutout]
     per_row = levels[0].shape[0] / figure.height_m * distance / (_FINE * camera.focal_px)
-    picture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
-    h, w = picture.shape[:2]
+    texture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
+    h, w = texture.shape[:2]
     v = (figure.height_m - eye - slope * depth) * (h / figure.height_m) - 0.5
     v = v.astype(np.float32)
     u = np.empty_like(v)
     u[:] = (aside / figure.width_m + 0.5) * w - 0.5
-    patch = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    patch = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     patch = patch.astype(np.float32)
     for hits in layers:
         wall = hits.depth[columns]

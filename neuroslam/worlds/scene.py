@@ -12,7 +12,7 @@ from neuroslam.worlds.atlas import Atlas, halvings
 
 
 class Surface(NamedTuple):
-    """A horizontal picture of the ground or the ceiling, seen as on a map: x to the right, y up.
+    """A horizontal image of the ground or the ceiling, seen as on a map: x to the right, y up.
 
     Attributes:
         image: ``uint8 (h, w, 3)``; its lower left corner lies at ``(x_m, y_m)``.
@@ -33,8 +33,8 @@ class Billboard(NamedTuple):
     Attributes:
         x_m: Where it stands.
         y_m: Where it stands.
-        width_m: Width of its picture.
-        height_m: Height of its picture; it stands on the floor.
+        width_m: Width of its image.
+        height_m: Height of its image; it stands on the floor.
         cutout: Which of the world's cut-outs it shows.
     """
 
@@ -140,7 +140,7 @@ class World:
     """Geometry and looks of a place; nothing in it moves.
 
     A wall runs from ``(x0, y0)`` to ``(x1, y1)`` and is seen from its right-hand side; solids are
-    walked counter-clockwise, rooms clockwise, so that a picture on it is never mirrored.
+    walked counter-clockwise, rooms clockwise, so that an image on it is never mirrored.
 
     Attributes:
         name: Its name in the catalogue.
@@ -148,14 +148,14 @@ class World:
         walls: ``float64 (n, 4)``: x0, y0, x1, y1 in metres.
         wall_strips: ``int (n,)``: which of ``strips`` each wall shows.
         wall_offsets_m: ``(n,)``: where on its strip the wall starts.
-        strips: Pictures of walls, ``uint8 (h, w, 3)``, and each one's pixels per metre.
+        strips: Images of walls, ``uint8 (h, w, 3)``, and each one's pixels per metre.
         pillars: ``(m, 3)``: x, y, radius in metres.
         pillar_strips: ``int (m,)``: which of ``strips`` goes around each pillar.
         billboards: Figures that stand still.
-        cutouts: Pictures of figures, ``uint8 (h, w, 4)``, the fourth channel is opacity.
+        cutouts: Images of figures, ``uint8 (h, w, 4)``, the fourth channel is opacity.
         people: For each kind of passer-by, the cut-outs of one walking cycle.
-        ground: Picture of the floor.
-        ceiling: Picture of the ceiling, or ``None`` under the open sky.
+        ground: Image of the floor.
+        ceiling: Image of the ceiling, or ``None`` under the open sky.
         sky: ``uint8 (h, w, 3)`` all around; its lower edge is the horizon. Needed if no ceiling.
         haze: Colour that distant things fade to.
         sight_m: Distance at which 63 % of a thing's colour has faded.
@@ -186,7 +186,7 @@ class World:
 
     @cached_property
     def atlas(self) -> Atlas:
-        """All surfaces in one picture, at several resolutions; made once."""
+        """All surfaces in one image, at several resolutions; made once."""
         return Atlas(self.strips, self.ground.image, self.ceiling and self.ceiling.image, self.sky)
 
     @cached_property
@@ -217,7 +217,7 @@ class Sense(NamedTuple):
         frames_per_lap: Frames in one lap of the first route; other routes keep the speed.
         laps: Laps.
         panoramic: Whether the camera sees all around.
-        horizon: Where the horizon is in the picture, from its top, as a share of the height.
+        horizon: Where the horizon is in the image, from its top, as a share of the height.
         camera_height_m: Height of the camera.
         odometry: Whether the robot has wheel odometry.
     """

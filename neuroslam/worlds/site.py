@@ -12,7 +12,7 @@ from neuroslam.worlds.scene import Billboard, World
 
 Point = tuple[float, float]
 Painter = Callable[[np.random.Generator, float], tuple[np.ndarray, float]]
-"""Paints a wall of a length (m): the picture and its pixels per metre."""
+"""Paints a wall of a length (m): the image and its pixels per metre."""
 
 
 class Site:
@@ -31,7 +31,7 @@ class Site:
         self.cutouts: list[np.ndarray] = []
 
     def wall(self, points: list[Point], painter: Painter, smooth: bool = False) -> None:
-        """Raise walls along a polyline, seen from its right; ``smooth``: one picture along all."""
+        """Raise walls along a polyline, seen from its right; ``smooth``: one image along all."""
         legs = list(pairwise(points))
         lengths = [math.dist(a, b) for a, b in legs]
         offset = 0.0

@@ -270,17 +270,17 @@ WRONG = {
     "three speeds": ({"velocity": (1.0, 0.0, 0.0)}, "odometry is of type tuple; expected speed"),
     "text speed": ({"velocity": ("1", "0")}, "odometry is of type tuple; expected speed (m/s)"),
     "no turn rate": ({"velocity": Velocity(1.0, None)}, "odometry is of type Velocity; expected"),
-    "float image": ({"image": np.ones((40, 64))}, "picture is float64 (40, 64); expected uint8"),
+    "float image": ({"image": np.ones((40, 64))}, "image is float64 (40, 64); expected uint8"),
     "image with alpha": (
         {"image": np.ones((40, 64, 4), np.uint8)},
-        "picture is uint8 (40, 64, 4); expected uint8, (h, w) or (h, w, 3)",
+        "image is uint8 (40, 64, 4); expected uint8, (h, w) or (h, w, 3)",
     ),
-    "no pixels": ({"image": np.ones((0, 64), np.uint8)}, "picture is uint8 (0, 64); expected"),
-    "list as image": ({"image": [[0, 1]]}, "picture is of type list, no array of numpy; expected"),
-    "file as image": ({"image": "a.png"}, "picture is 'a.png', no array of numpy; expected uint8"),
+    "no pixels": ({"image": np.ones((0, 64), np.uint8)}, "image is uint8 (0, 64); expected"),
+    "list as image": ({"image": [[0, 1]]}, "image is of type list, not a numpy array; expected"),
+    "file as image": ({"image": "a.png"}, "image is 'a.png', not a numpy array; expected uint8"),
     "tensor as image": (
         {"image": torch.zeros(40, 64, dtype=torch.uint8)},
-        "picture is an array of torch.uint8 of shape (40, 64), no array of numpy; expected",
+        "image is an array of torch.uint8 of shape (40, 64), not a numpy array; expected",
     ),
     "time of text": ({"time_s": "noon"}, "its time is 'noon'; expected a number, in s"),
     "no time": ({"time_s": None}, "its time is None; expected a number, in s"),
@@ -369,7 +369,7 @@ def test_a_merge_of_two_sessions_is_the_union_of_all_that_they_know(cells, sessi
     n = report.counts["experiences"]
     assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     if "place" in cells:
-        n = report.counts["place cells"]
+        n = report.counts["place_cells"]
         assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     one, other = loaded.semantic.landmarks(), merged.semantic.landmarks()
     order = np.argsort(one["number"]), np.argsort(other["number"])

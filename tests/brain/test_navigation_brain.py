@@ -259,7 +259,7 @@ def test_two_sessions_in_one_arena_become_one_map(squares):
     assert felt[0] + felt[1] == pytest.approx(felt[2], rel=1e-5)
     n_walls = [int(b.navigation.walls.n_walls) for b in (*squares, merged)]
     assert n_walls[2] < n_walls[0] + n_walls[1]
-    assert "stretches of wall lie on those of the other map" in reports[0].found
+    assert "stretches of wall align with the other map's" in reports[0].found
     assert merged.map.residuals_m.max() < 1e-9
     graph, _ = merged.navigation.place.graph()
     away = torch.cdist(graph[:first], graph[first:])
@@ -281,7 +281,7 @@ def test_who_goes_on_after_a_merge_knows_where_it_is(squares, lived):
 
 def test_a_merge_with_itself_adds_nothing(squares):
     merged, reports = join_brains(squares[0], squares[0])
-    assert reports[0].reason == "nothing is new: the place was known"
+    assert reports[0].reason == "nothing is new: every experience was known"
     assert merged.map.n == squares[0].map.n
     assert torch.equal(merged.navigation.walls.n_walls, squares[0].navigation.walls.n_walls)
 
@@ -303,7 +303,7 @@ def test_a_circle_is_not_a_nonagon(lived):
     (round_, _), (nine, _) = lived(ROUND), lived(NINE)
     merged, reports = join_brains(round_, nine)
     assert merged is None
-    assert "would be by 0.017 m" in reports[0].reason
+    assert "walls of one place leave at most 0.017 m" in reports[0].reason
 
 
 def test_parallel_walls_alone_are_refused():

@@ -337,7 +337,7 @@ def test_shapes_that_do_not_fit_are_named():
         cells.activity = torch.zeros(3, 3, 3)
     with pytest.raises(MapError, match="view 5 is not bound, there are 0"):
         cells.see(known_view(cells, 5))
-    with pytest.raises(ValueError, match="must be odd"):
+    with pytest.raises(ValueError, match="expected an odd number"):
         PoseCellConfig(excite_size=6)
     assert issubclass(ConfigError, ValueError)
 

@@ -16,6 +16,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 
+from neuroslam.brain import load_brain
 from neuroslam.cli import main, output
 from neuroslam.config import preset_names
 from neuroslam.runs.inspect import inspect
@@ -91,11 +92,11 @@ def sources(tmp_path_factory):
     ("source", "cause"),
     [
         ("missing.avi", r"missing\.avi: no such file or folder; expected a video, "),
-        ("text.mp4", r"text\.mp4: is not a video that can be read"),
-        ("empty.avi", r"empty\.avi: is not a video that can be read"),
-        ("head.avi", r"head\.avi: is not a video that can be read, or is truncated"),
+        ("text.mp4", r"text\.mp4: cannot be read"),
+        ("empty.avi", r"empty\.avi: cannot be read"),
+        ("head.avi", r"head\.avi: cannot be read; expected a complete video"),
         ("none.avi", r"none\.avi: "),
-        ("nothing", r"nothing: holds no pictures"),
+        ("nothing", r"nothing: contains no images"),
         ("notes.pdf", r"notes\.pdf: is of no known kind"),
         ("empty.csv", r"empty\.csv: "),
         ("nan.csv", r"nan\.csv: frame 0 \(line 2\): its motion is v = nan m/s"),
@@ -295,8 +296,8 @@ def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
     source = f"{video(tmp_path / 'drive.avi', 40)}+{tmp_path}/log.csv"
     motion(tmp_path / "log.csv", [f"{i / 20!r},1.0,0.1" for i in range(10, 21)])
     done = call("run", source, "-o", tmp_path / "run", QUICK, "--stop", 5)
-    early = "motion begins at 0.5 s; 10 pictures before it were not used"
-    late = "motion ends at 1 s; 19 pictures after it were not used"
+    early = "motion begins at 0.5 s; 10 images before it were not used"
+    late = "motion ends at 1 s; 19 images after it were not used"
     assert done.code == 0
     assert (early in done.out, late in done.out) == (True, False)
     done = call("resume", tmp_path / "run", QUICK)
@@ -505,6 +506,19 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
     assert "error against the truth" in error
     assert written == f"Written: {out}"
+
+
+def test_an_old_name_of_a_key_is_read_and_told_in_one_line(tmp_path, call):
+    out = tmp_path / "run"
+    done = call("run", WORLD, "-o", out, "--stop", 3, QUICK, "--set", "sessions.carried=ignore")
+    assert done.code == 0
+    assert done.err == (
+        "neuroslam run: note: sessions: carried is called kidnapped now; the old name is read "
+        "until the next release\n"
+    )
+    assert load_brain(out / "brain.safetensors").config.sessions.kidnapped == "ignore"
+    again = call("resume", out, QUICK)
+    assert (again.code, again.err) == (0, "")  # what was written has the new name
 
 
 def test_one_is_told_in_the_singular(tmp_path, call):

@@ -102,7 +102,7 @@ def test_the_autocorrelogram_is_pearson_over_the_bins_visited_in_both(share_visi
     np.testing.assert_allclose(autocorrelogram(maps), expected, atol=1e-10)
 
 
-def test_silent_bins_fire_as_little_as_the_bin_that_fires_least():
+def test_silent_gives_unvisited_bins_the_lowest_rate():
     maps = in_a_disc(1.0 + np.abs(noise(0, n=16)))
     filled = np.where(np.isfinite(maps), maps, np.nanmin(maps))
     expected = direct_autocorrelogram(filled)
@@ -111,7 +111,7 @@ def test_silent_bins_fire_as_little_as_the_bin_that_fires_least():
 
 @given(seed=st.integers(0, 10_000), share_visited=st.floats(0.3, 1.0))
 @settings(max_examples=20, deadline=None)
-def test_the_autocorrelogram_looks_the_same_from_the_other_side(seed, share_visited):
+def test_the_autocorrelogram_is_symmetric_under_half_a_turn(seed, share_visited):
     rng = np.random.default_rng(seed)
     rates = np.where(rng.random((12, 15)) < share_visited, rng.random((12, 15)), np.nan)
     r = autocorrelogram(rates)
@@ -121,14 +121,14 @@ def test_the_autocorrelogram_looks_the_same_from_the_other_side(seed, share_visi
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_score_is_the_one_found_ring_by_ring(mode):
+def test_the_score_equals_that_of_a_loop_over_rings(mode):
     for rates in (lattice(17.0, 0.2, n=50) + 2.0 * noise(1, n=50), noise(2, n=50)):
         rates = in_a_disc(rates)[:, 3:]  # not square
         expected = direct_gridness(autocorrelogram(rates, mode))
         assert float(gridness(rates, mode)) == pytest.approx(expected, abs=1e-9)
 
 
-def test_many_maps_score_as_one_by_one_in_any_shape():
+def test_a_stack_of_maps_scores_like_single_maps():
     maps = np.stack([in_a_disc(noise(seed, n=40)) for seed in range(20)]).reshape(2, 10, 40, 40)
     maps[1, 3, 5:9, 5:9] = np.nan  # one arena differs from the others
     for mode in MODES:
@@ -150,7 +150,7 @@ def test_scores_agree_with_opexebo(oracle):
     assert recorded == pytest.approx(0.67, abs=0.005)
 
 
-def test_to_the_letter_of_eq_13_the_order_is_the_same(oracle):
+def test_skipping_unvisited_bins_keeps_the_order_of_the_scores(oracle):
     maps, expected = oracle
     scores = np.array([float(gridness(rates, "skip")) for rates in maps])
     np.testing.assert_allclose(scores[:8], expected[:8], atol=0.08)
@@ -161,7 +161,7 @@ def test_to_the_letter_of_eq_13_the_order_is_the_same(oracle):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("spacing_bins", [12.0, 17.0, 24.0])
 @pytest.mark.parametrize("degrees", [-25.0, 0.0, 7.0, 15.0, 29.0])
-def test_a_hexagonal_map_scores_high_however_it_lies(spacing_bins, degrees, mode):
+def test_a_hexagonal_map_scores_high_at_any_orientation(spacing_bins, degrees, mode):
     rates = lattice(spacing_bins, math.radians(degrees))
     assert gridness(rates, mode) > 1.2
     assert gridness(in_a_disc(rates), mode) > 1.2
@@ -179,28 +179,28 @@ def test_spacing_and_orientation_are_those_built_in(spacing_bins, degrees):
     assert 0.0 < stats.field_diameter_m < stats.spacing_m
 
 
-def test_a_stretched_grid_is_as_elliptic_as_it_was_stretched():
+def test_the_ellipticity_of_a_stretched_grid_is_its_stretch():
     rates = ndimage.zoom(lattice(14.0), (1.0, 1.25), order=3)
     assert grid_stats(rates, BIN_M).ellipticity == pytest.approx(1.25, abs=0.03)
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0])
-def test_squares_are_no_hexagons(degrees, mode):
+def test_a_square_grid_scores_below_zero(degrees, mode):
     rates = lattice(14.0, math.radians(degrees), waves=2)
     assert gridness(rates, mode) < 0.2
     assert gridness(in_a_disc(rates), mode) < 0.2
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_one_field_scores_about_nothing_and_has_no_spacing(mode):
+def test_one_field_scores_about_zero_and_has_no_spacing(mode):
     rates = in_a_disc(one_field())
     assert abs(float(gridness(rates, mode))) < 0.05
     assert math.isnan(grid_stats(rates, BIN_M, mode).spacing_m)
     assert np.isnan(grid_stats(rates, BIN_M, mode).peaks_m).all()
 
 
-def test_noise_scores_about_nothing():
+def test_noise_scores_about_zero():
     scores = gridness(np.stack([in_a_disc(noise(seed)) for seed in range(60)]))
     assert abs(np.median(scores)) < 0.2
     assert np.mean(scores > 0.5) < 0.05
@@ -247,14 +247,14 @@ def test_a_constant_map_has_no_score(rate, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_map_of_an_arena_never_entered_has_no_score_and_spoils_no_other(mode):
+def test_an_unvisited_map_has_no_score_and_does_not_change_others(mode):
     maps = np.stack([np.full((40, 40), np.nan), lattice(11.0, n=40)])
     scores = gridness(maps, mode)
     assert math.isnan(scores[0])
     assert scores[1] == pytest.approx(float(gridness(maps[1], mode)))
 
 
-def test_a_slope_over_the_arena_leaves_no_room_for_rings():
+def test_a_gradient_over_the_arena_leaves_no_room_for_rings():
     assert math.isnan(gridness(np.indices((30, 30))[0] + 0.0))
 
 
@@ -268,7 +268,7 @@ def test_a_slope_over_the_arena_leaves_no_room_for_rings():
         (np.full((40, 40), np.inf), "a rate is infinite"),
     ],
 )
-def test_what_is_no_map_is_refused_in_one_line(function, maps, says):
+def test_an_invalid_map_is_refused_in_one_line(function, maps, says):
     with pytest.raises(MapError, match=says) as refused:
         function(maps)
     assert "\n" not in str(refused.value)

@@ -32,7 +32,7 @@ def test_a_hand_worked_curve():
 def test_bounds_and_order_do_not_matter(answers):
     distances, right = (np.array(column) for column in zip(*answers, strict=True))
     if not right.any():
-        with pytest.raises(MapError, match="no right answer to find"):
+        with pytest.raises(MapError, match="0 correct matches exist, expected at least one"):
             precision_recall(distances, right)
         return
     value = average_precision(precision_recall(distances, right))
@@ -41,7 +41,7 @@ def test_bounds_and_order_do_not_matter(answers):
     assert average_precision(backwards) == pytest.approx(value)
 
 
-def test_a_perfect_ranking_is_one_and_what_was_not_found_counts():
+def test_a_perfect_ranking_is_one_and_missing_matches_count():
     distances, right = np.arange(4.0), np.array([True, True, False, False])
     assert average_precision(precision_recall(distances, right)) == 1.0
     assert precision_recall(distances, right, n_right=4).recall[-1] == 0.5
@@ -62,7 +62,7 @@ def test_a_corridor_walked_twice(shared, tmp_path):
     assert (tmp_path / "pr_curves.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_experiment_is_that_of_the_view_cells():
+def test_the_experiment_matches_as_the_view_cells_do():
     """Distances are symmetric at shift 0, zero to itself, and those of a search at any."""
     images = [np.random.default_rng(i).integers(0, 256, (48, 64), np.uint8) for i in range(4)]
     config = view_matching.ViewConfig(template_width=16, template_height=12, shift_match=0)

@@ -39,7 +39,7 @@ def gathered(positions, activity):
 def test_bins_cover_every_point_and_their_edges_are_multiples(bin_m):
     points = np.random.default_rng(0).uniform(-1.3, 2.1, (500, 2))
     bins = Bins.around(points, bin_m)
-    assert (bins.index(points) >= 0).all()
+    assert (bins.flat_index(points) >= 0).all()
     left, right, lower, upper = bins.extent_m
     for edge in (left, right, lower, upper):
         assert abs(math.remainder(edge, bin_m)) < 1e-9
@@ -48,7 +48,7 @@ def test_bins_cover_every_point_and_their_edges_are_multiples(bin_m):
     assert 0.0 <= upper - high[1] < bin_m
 
 
-def test_a_box_of_whole_bins_gets_just_these():
+def test_a_box_of_whole_bins_gets_no_extra_bin():
     for half in np.arange(1, 60) * 0.025:
         assert Bins.around([[-half, -half], [half, half]]).shape == (round(half / 0.0125),) * 2
 
@@ -63,7 +63,7 @@ def test_rows_are_y_and_columns_are_x():
 def test_the_mean_of_every_bin_is_that_of_its_samples():
     positions, activity = wander(1)
     rates = rate_map(positions, activity, ARENA, sigma_bins=0.0)
-    index = ARENA.index(positions)
+    index = ARENA.flat_index(positions)
     for flat in np.unique(index):
         np.testing.assert_allclose(
             rates.reshape(3, -1)[:, flat], activity[index == flat].mean(axis=0), rtol=1e-12
@@ -107,7 +107,7 @@ def test_a_constant_activity_gives_a_constant_map_up_to_the_edge(sigma_bins):
     np.testing.assert_allclose(rates[:, :10], 3.7, rtol=1e-12)
 
 
-def test_smoothing_stays_within_the_rates_there_were():
+def test_smoothing_stays_within_the_range_of_the_rates():
     positions, activity = wander(2)
     raw, smooth = (rate_map(positions, activity, ARENA, sigma) for sigma in (0.0, 2.0))
     np.testing.assert_array_equal(np.isnan(raw), np.isnan(smooth))
@@ -127,7 +127,7 @@ def test_smoothing_is_the_weighted_mean_of_the_formula():
     np.testing.assert_allclose(maps.maps(sigma)[:, row, column], expected, rtol=1e-10)
 
 
-def test_a_bin_visited_too_seldom_is_unvisited():
+def test_a_bin_with_too_few_samples_is_unvisited():
     positions = [[0.01, 0.01]] * 3 + [[0.21, 0.01]]
     assert np.isfinite(rate_map(positions, np.ones(4), ARENA)).sum() == 2
     seldom = rate_map(positions, np.ones(4), ARENA, min_occupancy_samples=2)
@@ -160,7 +160,7 @@ def test_fields_are_counted_and_measured():
     touching = np.zeros((60, 60))
     touching[:30], touching[30, 5] = 1.0, 1.0
     found = fields(np.stack([rates, silent, touching, never, rates]), 0.02)
-    assert found.count.tolist() == [3, 0, 1, 0, 3]
+    assert found.n_fields.tolist() == [3, 0, 1, 0, 3]
     half_maximum_m = 2.0 * 6.0 * math.sqrt(2.0 * math.log(2.0)) * 0.02
     assert found.diameter_m[0] == pytest.approx(half_maximum_m, abs=0.02)  # a bin
     assert found.area_m2[2] == pytest.approx(1801 * 0.02**2)
@@ -168,13 +168,13 @@ def test_fields_are_counted_and_measured():
     assert np.isnan(found.diameter_m[[1, 3]]).all()
 
 
-def test_a_speck_is_no_field_and_unvisited_bins_part_fields():
+def test_a_small_region_is_no_field_and_unvisited_bins_separate_fields():
     rates = np.zeros((20, 20))
     rates[5:10, 2:18], rates[15, 15] = 1.0, 1.0
-    assert fields(rates, 0.025).count.tolist() == [1]
-    assert fields(rates, 0.025, min_area_m2=0.0).count.tolist() == [2]
+    assert fields(rates, 0.025).n_fields.tolist() == [1]
+    assert fields(rates, 0.025, min_area_m2=0.0).n_fields.tolist() == [2]
     rates[:, 9] = np.nan
-    assert fields(rates, 0.025).count.tolist() == [2]
+    assert fields(rates, 0.025).n_fields.tolist() == [2]
 
 
 @given(seed=st.integers(0, 1000), gain=st.floats(1e-3, 1e3))
@@ -183,7 +183,7 @@ def test_fields_do_not_depend_on_the_unit_of_the_rates(seed, gain):
     rng = np.random.default_rng(seed)
     maps = ndimage.gaussian_filter(rng.random((4, 20, 20)), (0, 1.5, 1.5)) ** 4
     once, again = fields(maps, 0.025), fields(gain * maps, 0.025)
-    np.testing.assert_array_equal(once.count, again.count)
+    np.testing.assert_array_equal(once.n_fields, again.n_fields)
     np.testing.assert_array_equal(once.area_m2, again.area_m2)
 
 
@@ -203,7 +203,7 @@ def test_coverage_is_the_share_of_bins_that_can_be_visited():
 
 
 @pytest.mark.parametrize("share", [1, 2, 4, 8, 16])
-def test_a_cell_that_fires_in_one_of_n_bins_tells_log2_n_bits(share):
+def test_a_cell_that_fires_in_one_of_n_bins_has_log2_n_bits(share):
     rates = np.zeros(16)
     rates[: 16 // share] = 3.0
     bits = spatial_information(rates.reshape(4, 4), np.full((4, 4), 2.5))
@@ -223,7 +223,7 @@ def test_information_is_not_negative_and_has_no_unit_of_rate(seed, gain):
     assert (bits <= np.log2(weight / occupancy.min())).all()  # as if in the rarest bin only
 
 
-def test_a_silent_cell_tells_nothing_that_has_a_value():
+def test_a_silent_cell_has_no_information():
     bits = spatial_information(np.stack([np.zeros((3, 3)), np.eye(3)]), np.ones((3, 3)))
     assert math.isnan(bits[0])
     assert bits[1] == pytest.approx(math.log2(3.0))
@@ -269,13 +269,13 @@ here = np.array([[0.1, 0.1], [0.2, 0.1]])
         (lambda: spatial_information(np.ones((2, 2)), np.zeros((2, 2))), "no visited bin"),
     ],
 )
-def test_mistakes_are_told_in_one_line(mistake, says):
+def test_invalid_input_is_refused_in_one_line(mistake, says):
     with pytest.raises(MapError, match=says) as refused:
         mistake()
     assert "\n" not in str(refused.value)
 
 
-def test_a_refused_piece_changes_nothing():
+def test_refused_samples_change_nothing():
     maps = gathered(*wander(0))
     sums, counts = maps.sums.copy(), maps.counts.copy()
     with pytest.raises(MapError):

@@ -88,7 +88,7 @@ def test_what_a_world_can_lose_is_lost(loss):
     if "ranges" in loss:
         assert during.ranges is None
         assert after.ranges is not None
-    if "carried" in loss:
+    if "kidnapped" in loss:
         jump = np.hypot(*(np.array(source.truth(1000)[:2]) - np.array(source.truth(999)[:2])))
         assert jump > 5.0
         assert source.odometry()[1000, 0] == pytest.approx(source.odometry()[998, 0], rel=1e-6)

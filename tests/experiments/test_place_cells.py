@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from neuroslam.experiments import place_cells as experiment
 from neuroslam.experiments import place_lives as lives
 from neuroslam.experiments.animals import live, live_with, read_track
-from neuroslam.figures.places import Spread
+from neuroslam.figures.place_errors import Spread
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
 
 SEEDS = (3, 8)

@@ -48,7 +48,7 @@ def test_an_arena_is_drawn_whole_in_metres_with_equal_axes():
     assert x[1] > ring.bounds[1]
 
 
-def test_a_firing_map_lies_where_its_bins_are_and_ends_at_its_peak():
+def test_a_rate_map_covers_its_bins_and_its_scale_ends_at_the_peak():
     axes = new_figure(3, 3, None).subplots()
     cell = firing(scale=3.0)
     cd.draw_rate_map(axes, cell.rate_map, BINS, ARENA)
@@ -57,7 +57,7 @@ def test_a_firing_map_lies_where_its_bins_are_and_ends_at_its_peak():
     assert image.get_clim() == (0.0, np.nanmax(cell.rate_map))
 
 
-def test_a_cell_that_never_fires_or_was_nowhere_can_be_drawn():
+def test_a_silent_cell_and_an_unvisited_map_can_be_drawn():
     axes = new_figure(3, 3, None).subplots()
     for rates in (np.zeros(BINS.shape), np.full(BINS.shape, np.nan)):
         cd.draw_rate_map(axes, rates, BINS, ARENA)
@@ -103,7 +103,7 @@ def test_firing_maps_of_one_figure_share_their_scale():
     assert len(limits) == 1
 
 
-def test_grids_are_drawn_in_pairs_and_say_which_method_and_when():
+def test_grids_are_drawn_in_pairs_with_method_and_time():
     rows = {"ours": [firing("5 min"), firing("9 min")], "theirs": [firing("5 min")] * 2}
     figure = cd.plot_grids(rows, "grids")
     axes = [ax for ax in panels(figure) if ax.images and ax.get_xlim()[1] > 0]
@@ -113,13 +113,13 @@ def test_grids_are_drawn_in_pairs_and_say_which_method_and_when():
     assert axes[1].get_title(loc="left") == "score 1.00"
 
 
-def test_firing_is_drawn_on_the_track_above_its_map():
+def test_firing_is_drawn_on_the_track_above_the_rate_map():
     figure = cd.plot_firing([firing(), firing("recorded")], "cells")
     assert panels(figure)[1].get_title(loc="left") == "recorded"
     assert render(figure, dpi=40).std() > 5
 
 
-def test_encounters_show_no_more_than_was_walked_by_then():
+def test_encounters_show_the_path_up_to_each_time():
     where = np.random.default_rng(1).uniform(-1, 1, (40, 2))
     activity = np.linspace(0.0, 1.0, 40)
     stops = {"10 s|3 activated": 10, "40 s|9 activated": 40}

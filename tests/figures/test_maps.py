@@ -101,7 +101,7 @@ def all_axes(figure):
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_nothing_is_cut_off_and_titles_do_not_run_into_each_other(name):
+def test_nothing_is_clipped_and_titles_do_not_overlap(name):
     figure = FIGURES[name]()
     style.render(figure)
     page = figure.bbox
@@ -176,7 +176,7 @@ def test_the_counts_of_a_real_map_are_in_its_title(shared):
     assert len(segments(right, style.MAP)) == 1139
 
 
-def test_a_metre_is_as_long_upward_as_sideways():
+def test_axes_have_equal_scale():
     figure = full_map()
     style.render(figure)
     for axes in figure.get_axes():
@@ -191,7 +191,7 @@ def test_the_legend_lies_below_the_data():
         assert axes.get_legend().get_window_extent().y1 < axes.bbox.y0
 
 
-def test_the_map_stays_where_it_is_and_the_truth_is_laid_over_it_with_its_walls_and_its_error():
+def test_the_truth_and_its_walls_are_aligned_to_the_map_and_its_error_is_named():
     c, s = np.cos(0.5), np.sin(0.5)
     truth = 2.0 * SQUARE[:, :2] @ np.array([[c, -s], [s, c]]).T + [10.0, -5.0]
     here = Pose(0.0, 1.0, 0.25)
@@ -200,15 +200,15 @@ def test_the_map_stays_where_it_is_and_the_truth_is_laid_over_it_with_its_walls_
     np.testing.assert_array_equal(segments(axes, style.LOOP)[0], SQUARE[[3, 0], :2])
     np.testing.assert_allclose(segments(axes, style.WALL)[0], SQUARE[:2, :2], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
-    laid = labels["truth: ATE 0.0 cm, scaled by 0.5"]
-    np.testing.assert_allclose(laid.get_xydata(), SQUARE[:, :2], atol=1e-9)
+    aligned = labels["truth: ATE 0.0 cm, scaled by 0.5"]
+    np.testing.assert_allclose(aligned.get_xydata(), SQUARE[:, :2], atol=1e-9)
     robot = labels["robot now"]
     np.testing.assert_array_equal(robot.get_xydata()[0], here[:2])
     tip = robot._marker.get_transform().transform((1.0, 0.0))
     assert np.arctan2(tip[1], tip[0]) == pytest.approx(0.25)
 
 
-def test_places_and_links_have_the_colour_of_their_session_which_the_legend_names():
+def test_experiences_and_links_have_the_colour_of_their_session():
     names = ["monday.mp4", "tuesday.mp4", "wednesday.mp4"]
     session = np.array([0, 0, 1, 1])
     figure = maps.plot_map(
@@ -225,8 +225,8 @@ def test_places_and_links_have_the_colour_of_their_session_which_the_legend_name
     np.testing.assert_array_equal(dots[style.MAP.lower()], SQUARE[:2, :2])
     assert [len(segments(right, colour)) for colour in style.SESSIONS[:2]] == [1, 2]
     assert [text.get_text() for text in right.get_legend().get_texts()] == [
-        "monday.mp4", "tuesday.mp4", "wednesday.mp4: no place of its own", "loop closure", "start",
-        "end",
+        "monday.mp4", "tuesday.mp4", "wednesday.mp4: no experience of its own", "loop closure",
+        "start", "end",
     ]  # fmt: skip
     assert left.get_legend().get_texts()[0].get_text() == "odometry of tuesday.mp4"
 
@@ -236,19 +236,19 @@ def test_a_truth_that_does_not_fit_the_track_is_refused():
         maps.plot_map(SQUARE, RING, truth_xy=np.zeros((7, 2)))
 
 
-def test_a_robot_that_stood_still_is_drawn_where_it_stood():
+def test_a_robot_at_rest_is_drawn_at_its_position():
     figure = maps.plot_map(SQUARE[:1], np.empty((0, 2)), truth_xy=[[0.0, 3.0]])
     labels = [line.get_label() for line in figure.get_axes()[0].get_lines()]
     assert "truth: ATE 3.00 m, not aligned" in labels
 
 
-def test_a_map_without_a_single_experience_says_so_and_shows_no_robot():
+def test_a_map_without_experiences_is_labelled_and_shows_no_robot():
     none, here = np.empty((0, 2)), Pose(0.0, 0.0, 0.0)
     figure = maps.plot_map(np.empty((0, 3)), none, odometry_xy=none, current=here)
     assert style.render(figure).std() > 0
     axes = figure.get_axes()[1]
     assert axes.get_title("right") == "0 experiences · 0 links · 0 loop closures"
-    assert [text.get_text() for text in axes.texts] == ["no places"]
+    assert [text.get_text() for text in axes.texts] == ["no experiences"]
     assert (len(axes.get_lines()), len(axes.get_xticks())) == (0, 0)
 
 
@@ -273,10 +273,10 @@ def test_views_above_the_threshold_are_new_and_the_first_has_no_error():
     assert labels == ["22 links", "21 experiences", "20 templates"]
 
 
-def test_without_views_there_is_no_recognition_and_no_count_of_templates():
+def test_without_views_there_are_no_matches_and_no_count_of_templates():
     blind = frames() | {"match_error": np.full(40, -1.0), "n_templates": np.zeros(40)}
     (memory,) = maps.plot_signals(blind, threshold=0.05).get_axes()
-    assert memory.get_title("left") == "Memory"
+    assert memory.get_title("left") == "Size of the map"
     labels = [text.get_text() for text in memory.get_legend().get_texts()]
     assert labels == ["22 links", "21 experiences"]
 
@@ -289,7 +289,7 @@ def test_names_in_any_script_are_drawn_without_a_warning(tmp_path):
     assert set(style.STYLE["font.family"]) <= there
 
 
-def test_a_first_view_says_that_there_was_nothing_to_compare_with():
+def test_the_first_view_has_no_match_error():
     image = pictures(1)[0]
     axes = maps.plot_frame_and_template(image, image / 255.0, -1.0, 0).get_axes()[1]
     assert axes.get_title("left") == "Template 0"
@@ -323,5 +323,5 @@ def test_a_sheet_of_unequal_pictures_is_refused(images, titles, said):
 def test_a_summary_leaves_out_what_the_brain_does_not_have():
     figure = maps.plot_summary(SQUARE, RING, frames())
     names = [axes.get_title("left") for axes in figure.get_axes()]
-    assert names == ["Experience map", "Recognition", "Memory"]
+    assert names == ["Experience map", "View matches", "Size of the map"]
     assert style.render(figure).shape == (1000, 1400, 3)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from neuroslam.figures import place_errors as pe
 from neuroslam.figures import places as pd
 from neuroslam.figures.style import render, save
 from neuroslam.types import Pose
@@ -24,7 +25,7 @@ def place(name="SLRB, 5 min"):
 
 
 def spread(values):
-    return pd.Spread(np.array([0.0, 1.0, 2.0]), np.asarray(values, dtype=float))
+    return pe.Spread(np.array([0.0, 1.0, 2.0]), np.asarray(values, dtype=float))
 
 
 def test_maps_of_places_share_their_axes_and_are_true_to_scale():
@@ -39,33 +40,33 @@ def test_maps_of_places_share_their_axes_and_are_true_to_scale():
     assert x_min < -1.0
     assert x_max > far.centres_m[:, 0].max()
     assert figure.axes[1].get_title("left") == "drifted"
-    assert figure.axes[1].get_title("right") == "40 places"
+    assert figure.axes[1].get_title("right") == "40 cells"
 
 
-def test_a_map_of_one_place_can_be_drawn():
+def test_a_map_of_one_cell_can_be_drawn():
     one = pd.PlaceMap("first", np.zeros((1, 2)), np.empty((0, 2), int))
     figure = pd.plot_place_maps([[one]], ARENA, PATH)
-    assert figure.axes[0].get_title("right") == "1 place"
+    assert figure.axes[0].get_title("right") == "1 cell"
     assert render(figure).std() > 0
 
 
-def test_place_cells_are_drawn_with_the_walls_that_are_remembered_where_there_are():
+def test_place_cells_are_drawn_with_remembered_walls():
     here, feet = Pose(0.1, 0.2, 0.0), np.array([[1.0, 0.0], [0.0, 1.0]])
     (axes,) = pd.plot_place_cells(CENTRES, LINKS, feet, here, PATH).axes
-    said = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
-    np.testing.assert_array_equal(said["remembered wall, in 2 parts"], feet)
-    np.testing.assert_array_equal(said["the animal now"], [here[:2]])
-    assert "40 place cells" in said
+    labels = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+    np.testing.assert_array_equal(labels["remembered wall, in 2 parts"], feet)
+    np.testing.assert_array_equal(labels["the animal now"], [here[:2]])
+    assert "40 place cells" in labels
     (bare,) = pd.plot_place_cells(CENTRES, LINKS, np.empty((0, 2)), here, PATH).axes
     assert bare.get_title("left") == "Place cells"
     assert not any("wall" in line.get_label() for line in bare.get_lines())
 
 
-def test_paths_tell_their_mean_error_and_the_remembered_walls():
+def test_paths_have_their_mean_error_and_remembered_walls():
     feet = np.array([[1.0, 0.0], [0.0, 1.0]])
     off = PATH + np.array([0.03, 0.04])
-    told = [pd.PathTold("SLRB", off, feet), pd.PathTold("path integration", PATH)]
-    figure = pd.plot_paths(told, ARENA, PATH)
+    estimates = [pd.EstimatedPath("SLRB", off, feet), pd.EstimatedPath("path integration", PATH)]
+    figure = pd.plot_paths(estimates, ARENA, PATH)
     assert figure.axes[0].get_title("right") == "mean error 5.0 cm · 2 wall memories"
     assert figure.axes[1].get_title("right") == "mean error 0.0 cm"
     assert labels(figure)[:2] == ["SLRB", "path integration"]
@@ -74,7 +75,7 @@ def test_paths_tell_their_mean_error_and_the_remembered_walls():
 
 def test_a_path_of_another_length_than_the_truth_is_refused():
     with pytest.raises(ValueError, match="'SLRB' has 199 points, the truth 200"):
-        pd.plot_paths([pd.PathTold("SLRB", PATH[1:])], ARENA, PATH)
+        pd.plot_paths([pd.EstimatedPath("SLRB", PATH[1:])], ARENA, PATH)
 
 
 def test_cells_above_half_of_the_strongest_are_ringed_and_counted():
@@ -85,7 +86,7 @@ def test_cells_above_half_of_the_strongest_are_ringed_and_counted():
     assert axes.get_title("right") == "2 cells above half"
     rings = axes.collections[-1].get_offsets()
     np.testing.assert_allclose(rings, CENTRES[:2])
-    assert figure.axes[-1].get_ylabel() == "share of the strongest response"
+    assert figure.axes[-1].get_ylabel() == "rate / highest rate"
 
 
 def test_silent_cells_can_be_drawn():
@@ -97,13 +98,13 @@ def test_silent_cells_can_be_drawn():
 def test_a_band_is_the_mean_and_one_standard_deviation():
     cells = {"SLRB": spread([[0, 10, 20], [0, 14, 20]])}
     errors = {"SLRB": spread([[0.0, 0.01, 0.02], [0.0, 0.03, 0.02]])}
-    figure = pd.plot_growth(cells, errors, {"the paper": 0.031})
+    figure = pe.plot_growth(cells, errors, {"the paper": 0.031})
     left, right = figure.axes
     np.testing.assert_allclose(left.lines[0].get_ydata(), [0, 12, 20])
     np.testing.assert_allclose(right.lines[0].get_ydata(), [0.0, 2.0, 2.0])
     band = right.collections[0].get_paths()[0].vertices
     assert band[:, 1].max() == pytest.approx(3.0)
-    assert right.get_ylabel() == "error of position (cm)"
+    assert right.get_ylabel() == "position error (cm)"
     assert left.get_xlabel() == right.get_xlabel() == "time (min)"
     assert labels(figure) == ["SLRB", "the paper: 3.1 cm"]
 
@@ -113,7 +114,7 @@ def test_bars_are_means_in_centimetres_grouped_by_track():
         "SLRB": {"triangle": np.array([0.02, 0.04]), "hafting": np.array([0.05])},
         "RatSLAM": {"triangle": np.array([0.10]), "hafting": np.array([0.20])},
     }
-    figure = pd.plot_errors(errors)
+    figure = pe.plot_errors(errors)
     axes = figure.axes[0]
     assert [bar.get_height() for bar in axes.patches] == pytest.approx([3.0, 5.0, 10.0, 20.0])
     assert [tick.get_text() for tick in axes.get_xticklabels()] == ["triangle", "hafting"]
@@ -122,7 +123,7 @@ def test_bars_are_means_in_centimetres_grouped_by_track():
 
 def test_the_sweep_has_two_boxes_and_a_bar_for_each_threshold(tmp_path):
     errors = [RNG.uniform(0, r, 100) for r in (0.04, 0.08)]
-    figure = pd.plot_sweep((0.04, 0.08), errors, errors, [np.array([500, 520]), np.array([200])])
+    figure = pe.plot_sweep((0.04, 0.08), errors, errors, [np.array([500, 520]), np.array([200])])
     left, right = figure.axes
     assert [bar.get_height() for bar in right.patches] == [510, 200]
     assert [tick.get_text() for tick in left.get_xticklabels()] == ["4", "8"]
@@ -138,9 +139,9 @@ def test_the_sweep_has_two_boxes_and_a_bar_for_each_threshold(tmp_path):
         lambda: pd.plot_place_maps([[place()], [place(), place()]], ARENA, PATH),
         lambda: pd.plot_paths([], ARENA, PATH),
         lambda: pd.plot_responses([], ARENA),
-        lambda: pd.plot_growth({}, {}),
-        lambda: pd.plot_errors({}),
-        lambda: pd.plot_sweep([], [], [], []),
+        lambda: pe.plot_growth({}, {}),
+        lambda: pe.plot_errors({}),
+        lambda: pe.plot_sweep([], [], [], []),
     ],
 )
 def test_nothing_to_draw_is_refused(call):
@@ -149,6 +150,6 @@ def test_nothing_to_draw_is_refused(call):
 
 
 def test_methods_keep_their_colour_in_all_figures():
-    assert pd.colour_of("SLRB, 5 min") == pd.METHODS["SLRB"]
-    assert len(set(pd.METHODS.values())) == 4
-    assert pd.colour_of("something else") not in pd.METHODS.values()
+    assert pe.colour_of("SLRB, 5 min") == pe.METHODS["SLRB"]
+    assert len(set(pe.METHODS.values())) == 4
+    assert pe.colour_of("something else") not in pe.METHODS.values()

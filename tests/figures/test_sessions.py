@@ -9,6 +9,7 @@ from mpl_toolkits.mplot3d.art3d import Line3D, Line3DCollection
 
 from neuroslam.figures import sessions as md
 from neuroslam.figures import style
+from neuroslam.figures.session_panels import ORDINALS
 
 TORUS = (21, 21, 36)
 
@@ -117,7 +118,7 @@ def legend_of(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def said(axes):
+def notes_of(axes):
     return " ".join(text.get_text() for text in axes.texts)
 
 
@@ -133,7 +134,7 @@ def test_equal_figures_give_equal_bytes(draw, tmp_path):
 
 
 @ALL
-def test_no_text_is_clipped_or_lies_on_another(draw):
+def test_no_text_is_clipped_or_overlaps(draw):
     figure = draw()
     with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
@@ -154,7 +155,7 @@ def test_no_text_is_clipped_or_lies_on_another(draw):
 
 
 @FLAT
-def test_a_metre_is_a_metre_and_everything_is_in_sight(draw):
+def test_axes_have_equal_scale_and_show_everything(draw):
     figure = draw()
     with mpl.rc_context(style.STYLE):
         figure.canvas.draw()
@@ -195,7 +196,7 @@ def test_panels_fill_the_width_they_have(draw):
 
 
 def test_every_session_has_its_own_colour_and_red_and_purple_are_none_of_them():
-    assert len({colour.lower() for colour in md.SESSIONS}) == len(md.ORDINALS) == 6
+    assert len({colour.lower() for colour in md.SESSIONS}) == len(ORDINALS) == 6
     assert md.MATCH not in md.SESSIONS
     assert md.REFERENCE not in md.SESSIONS
 
@@ -224,31 +225,31 @@ def test_every_experience_and_link_is_drawn_in_the_colour_of_its_session():
     assert np.array_equal(rings(axes)[0].get_xydata(), FINAL.merge_points)
 
 
-def test_a_map_that_is_not_linked_is_drawn_beside_and_its_panel_says_so():
+def test_an_unlinked_map_is_drawn_beside_and_labelled():
     axes = stages().axes[1]
     blue, orange = nodes(axes, md.SESSIONS[0]), nodes(axes, md.SESSIONS[1])
     apart = (blue.min(axis=0) > orange.max(axis=0)) | (orange.min(axis=0) > blue.max(axis=0))
     assert apart.any()
     moves = orange - PARTIAL.poses[:, :2]
     assert np.allclose(moves, moves[0])
-    assert "40 + 15 experiences · 39 + 14 links" in said(axes)
-    assert f"second session: own coordinates, moved {-moves[0, 1]:.3g} m down" in said(axes)
+    assert "40 + 15 experiences · 39 + 14 links" in notes_of(axes)
+    assert f"second session: own coordinates, moved {-moves[0, 1]:.3g} m down" in notes_of(axes)
     both = np.vstack([ring.get_xydata() for ring in rings(axes)])
     assert as_rows(both) == as_rows(
         np.vstack([MATCH.merge_points, PARTIAL.merge_points + moves[0]])
     )
 
 
-def test_a_map_that_lies_elsewhere_already_is_not_moved():
+def test_an_unlinked_map_without_overlap_is_not_moved():
     far = PARTIAL._replace(
         poses=PARTIAL.poses + np.array([40.0, 0, 0]), merge_points=np.zeros((0, 2))
     )
     axes = md.plot_stages([FIRST._replace(others=(far,))], None).axes[0]
     assert as_rows(nodes(axes, md.SESSIONS[1])) == as_rows(far.poses[:, :2])
-    assert said(axes).endswith("second session: own coordinates")
+    assert notes_of(axes).endswith("second session: own coordinates")
 
 
-def test_further_maps_do_not_lie_on_each_other():
+def test_unlinked_maps_do_not_overlap():
     third = PARTIAL._replace(title="third session", session=np.full(15, 2))
     axes = md.plot_stages([MATCH._replace(others=(PARTIAL, third, FIRST))], None).axes[0]
     low, high = zip(
@@ -257,17 +258,17 @@ def test_further_maps_do_not_lie_on_each_other():
     assert (low[0] > high[1]).any() or (low[1] > high[0]).any()
 
 
-def test_legends_name_what_is_there_and_nothing_else():
+def test_legends_name_exactly_what_is_drawn():
     everything = ["start of a session", "end of a session", "merge point"]
     assert legend_of(stages()) == ["first session", "second session", *everything]
     assert legend_of(md.plot_stages([FIRST._replace(starts=(), ends=())])) == ["first session"]
     assert legend_of(overlay()) == ["single session", "merged map, aligned"]
     assert legend_of(accuracy()) == ["first session", "second session", *everything[:2], "truth"]
-    names = ["first session", "second session", *everything[:2], "match", "shadow on θ = 0"]
+    names = ["first session", "second session", *everything[:2], "match", "x and y, drawn at θ = 0"]
     assert legend_of(bindings()) == names
 
 
-def test_sessions_with_names_are_all_in_the_legend_whether_or_not_they_made_a_place():
+def test_all_named_sessions_are_in_the_legend():
     names = ["1: monday.mp4", "2: tuesday.mp4", "3: a/very/long/name/of/a/video.mp4, no place"]
     figure = md.plot_stages([FINAL._replace(starts=(), ends=(), merge_points=())], None, names)
     assert legend_of(figure) == names
@@ -280,15 +281,15 @@ def test_sessions_with_names_are_all_in_the_legend_whether_or_not_they_made_a_pl
 def test_six_sessions_are_named_in_order():
     six = FIRST._replace(session=np.arange(40) % 6)
     labels = legend_of(md.plot_stages([six]))
-    assert labels[:6] == [f"{ordinal} session" for ordinal in md.ORDINALS]
+    assert labels[:6] == [f"{ordinal} session" for ordinal in ORDINALS]
 
 
 def test_a_map_of_one_experience_or_none_can_be_drawn():
     one = md.Stage("One", np.zeros((1, 3)), np.zeros((0, 2), int), np.zeros(1, int), starts=[0])
     none = md.Stage("None", np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0, int))
     first, second = md.plot_stages([one, none]).axes
-    assert said(first) == "1 experience · 0 links"
-    assert said(second) == "0 experiences · 0 links"
+    assert notes_of(first) == "1 experience · 0 links"
+    assert notes_of(second) == "0 experiences · 0 links"
     style.render(md.plot_stages([none]))
 
 
@@ -329,17 +330,17 @@ def test_bindings_of_two_sessions_are_not_joined_to_each_other():
     assert [len(c._segments3d) for c in lines] == [1, 1]
 
 
-def test_the_overlay_draws_both_maps_and_says_how_far_they_are_apart():
+def test_the_overlay_draws_both_maps_and_their_rmse():
     (axes,) = overlay().axes
     assert axes.get_title(loc="left") == "Ellipse"
-    assert said(axes) == "RMSE 0.0707 m (0.254 % of the diagonal)"
+    assert notes_of(axes) == "RMSE 0.0707 m (0.254 % of the diagonal)"
     reference = FINAL.poses[:, :2]
     assert as_rows(nodes(axes, md.REFERENCE)) == as_rows(reference)
     assert as_rows(nodes(axes, md.ROBOT)) == as_rows(reference + 0.05)
     assert [len(c.get_segments()) for c in axes.collections] == [len(FINAL.links)] * 2
 
 
-def test_an_overlay_without_links_is_of_points_alone():
+def test_an_overlay_without_links_draws_points_only():
     figure = md.plot_overlay(FIRST.poses[:, :2], FIRST.poses[:, :2], 0.0, 0.0)
     assert not figure.axes[0].collections
     assert all(handle.get_ls() == "None" for handle in figure.legends[0].legend_handles)
@@ -382,7 +383,7 @@ def test_tracks_and_truth_are_not_joined_from_one_session_to_the_next():
         ),
     ],
 )
-def test_a_mistake_is_named_in_one_line(call, message):
+def test_invalid_input_is_refused_in_one_line(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)

@@ -24,7 +24,7 @@ from neuroslam.merging.states import make_join, merge_states
 from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
 from neuroslam.state.match import Match
-from neuroslam.state.population import Population
+from neuroslam.state.mergeable import Mergeable
 from neuroslam.state.sessions import Session
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
@@ -326,7 +326,7 @@ def corridor():
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corridor):
+def test_every_number_of_a_brain_belongs_to_a_part_with_a_rule(name, corridor):
     config = CONFIGS[name]
     lives = []
     for frames in (corridor[:40], corridor[20:]):
@@ -337,8 +337,9 @@ def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corri
         lives.append(brain)
     loaded, partial = lives
     parts = partial.parts()
-    assert parts
-    assert all(isinstance(part, Population) for part in parts.values())
+    assert all(isinstance(part, Mergeable) for part in parts.values())
+    assert all(parts[one.name] is one for one in partial.populations.values())
+    assert parts.keys() > {one.name for one in partial.populations.values()}
     for key in partial.state_dict():
         top = key.split(".")[0]
         assert top in parts or top == "stored", key
@@ -379,7 +380,7 @@ def test_a_number_beside_all_parts_is_named_and_not_forgotten():
 
 
 def test_a_rule_that_forgets_a_number_is_named():
-    class Forgetful(Population):
+    class Forgetful(Mergeable):
         def __init__(self):
             super().__init__()
             self.register_buffer("kept", torch.zeros(1))

@@ -343,6 +343,11 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
     assert (page.arrays["row_place"] == -1).tolist() == nowhere.tolist()
     (left,) = page.about["not_joined"]
     assert "looked like one of it" in left["reason"]
+    began = [session["began"] for session in page.about["sessions"]]
+    assert "kidnapped" in began
+    written = (Path(collect.__file__).parent / "tables.js").read_text()
+    words = re.search(r"const BEGAN = \{(.*?)\};", written)[1]
+    assert {*began, "start", "gap"} <= set(re.findall(r"(\w+):", words))
 
 
 def test_when_an_animal_was_lost_follows_from_its_doubt():

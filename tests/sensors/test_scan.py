@@ -144,7 +144,7 @@ def test_the_scan_given_is_left_as_it_was():
 @pytest.mark.parametrize(
     ("scan", "options", "says"),
     [
-        (np.ones((2, 90)), {}, "shape (2, 90); expected (n,), at least 8 beams"),
+        (np.ones((2, 90)), {}, "shape (2, 90); expected (n,): metres, at least 8 beams"),
         (np.ones(7), {}, "shape (7,); expected (n,), at least 8 beams"),
         (np.array([1.0] * 9 + [np.nan]), {}, "beam 9 measures nan m; expected"),
         (np.array([1.0, -0.5] + [1.0] * 8), {}, "beam 1 measures -0.5 m; expected"),

@@ -1,4 +1,4 @@
-"""Tuning finds what a drive needs in the drive itself, and says so where it cannot."""
+"""Tuning finds the parameters of a drive in the drive itself, and reports where it cannot."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from neuroslam.tuning import tune
 from neuroslam.tuning.drive import key_frames, read_drive
 from neuroslam.tuning.motion import FIELDS_OF_VIEW_DEG, Shifts, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits
-from neuroslam.tuning.search import Trial, best_of, judge
+from neuroslam.tuning.search import Trial, best_of, score_map
 from neuroslam.view.preprocess import Encoded
 
 SMALL = "world:ellipse?laps=1.4&width=64&height=32&rate=10"
@@ -31,7 +31,7 @@ PICTURES = SMALL + "&odometry=false&frames_per_lap=240"
 
 
 @pytest.fixture(scope="module")
-def driven():
+def drive():
     return read_drive(open_source(SMALL))
 
 
@@ -41,10 +41,10 @@ def tuned(tmp_path_factory):
     return tune(PICTURES, out / "tuning"), out / "tuning"
 
 
-def test_what_is_seen_twice_is_what_lies_one_lap_apart(driven):
-    keys = key_frames(driven)
-    truth = np.array([frame.truth[:2] for frame in driven.frames])[keys]
-    revisits = find_revisits(driven.pictures[keys])
+def test_revisits_are_frames_one_lap_apart(drive):
+    keys = key_frames(drive)
+    truth = np.array([frame.truth[:2] for frame in drive.frames])[keys]
+    revisits = find_revisits(drive.pictures[keys])
     assert len(revisits.same) > 0.4 * len(keys)
     apart = np.linalg.norm(truth[revisits.same[:, 0]] - truth[revisits.same[:, 1]], axis=1)
     assert np.quantile(apart, 0.99) < 0.5  # of an ellipse of many metres
@@ -52,7 +52,7 @@ def test_what_is_seen_twice_is_what_lies_one_lap_apart(driven):
     assert np.median(others) > 5.0
 
 
-def test_a_picture_that_a_network_cannot_use_is_left_out(driven):
+def test_a_picture_that_a_network_cannot_use_is_left_out(drive):
     seen = []
 
     def encoder(picture):
@@ -61,15 +61,17 @@ def test_a_picture_that_a_network_cannot_use_is_left_out(driven):
             raise BadFrame("features are not all finite numbers")
         return Encoded(np.zeros((4, 8)), 1.0)
 
-    drive = read_drive(open_source(SMALL), encoder=encoder)
-    assert (len(drive.frames), drive.unusable) == (len(driven.frames) - 1, 1)
+    encoded = read_drive(open_source(SMALL), encoder=encoder)
+    assert (len(encoded.frames), encoded.unusable) == (len(drive.frames) - 1, 1)
+    with pytest.raises(ValueError, match="read without an encoder"):
+        drive.templates(np.array([0]))
 
 
-def test_standing_still_gives_no_key_frames(driven):
-    still = [driven.frames[50]._replace(index=1000 + k, time_s=1000.0 + k) for k in range(60)]
-    paused = driven.__class__(driven.frames + still, driven.factor, driven.size, 0)
-    assert len(driven.frames) - len(key_frames(driven)) < 10
-    assert key_frames(paused).max() <= len(driven.frames)
+def test_a_robot_at_rest_gives_no_key_frames(drive):
+    still = [drive.frames[50]._replace(index=1000 + k, time_s=1000.0 + k) for k in range(60)]
+    paused = replace(drive, frames=drive.frames + still)
+    assert len(drive.frames) - len(key_frames(drive)) < 10
+    assert key_frames(paused).max() <= len(drive.frames)
 
 
 @given(st.floats(60.0, 140.0), st.integers(0, 5))
@@ -85,28 +87,28 @@ def test_the_field_of_view_is_the_one_that_closes_loops(fov_deg, seed):
     assert found.error.shape == FIELDS_OF_VIEW_DEG.shape
 
 
-def test_a_figure_of_eight_does_not_tell_the_field_of_view():
+def test_a_figure_of_eight_does_not_determine_the_field_of_view():
     shift_px = np.r_[np.full(100, 2.0), np.full(100, -2.0)]
     pairs = np.array([[0, 199], [1, 199]])
     assert field_of_view(Shifts((0, 9, 0, 9), shift_px, shift_px), 160, pairs) is None
 
 
 @pytest.mark.parametrize(
-    ("before", "found", "said"),
+    ("before", "found", "verdict"),
     [
-        (0.4, 0.05, "more consistent than before, 3 places fewer: take it"),
-        (0.019, 0.022, "about as consistent as before, 3 places fewer"),
-        (0.02, 0.2, "less consistent than before, 3 places fewer: keep what you had"),
-        (0.02, math.nan, "not known to be better: the drive does not tell"),
+        (0.4, 0.05, "more consistent than before, 3 experiences fewer: use the config found"),
+        (0.019, 0.022, "about as consistent as before, 3 experiences fewer"),
+        (0.02, 0.2, "less consistent than before, 3 experiences fewer: keep the config you had"),
+        (0.02, math.nan, "not known to be better: the drive has no revisits to measure it"),
     ],
 )
-def test_tuning_says_whether_it_is_worth_taking(before, found, said, tuned):
+def test_the_verdict_compares_the_maps_before_and_after(before, found, verdict, tuned):
     maps = [Trial(BrainConfig(), j, n, n, n, None) for j, n in ((before, 10), (found, 7))]
-    assert replace(tuned[0], before=maps[0], after=maps[1]).verdict == said
+    assert replace(tuned[0], before=maps[0], after=maps[1]).verdict == verdict
 
 
 class Mapped:
-    """A brain as far as :func:`judge` looks at it."""
+    """The parts of a brain that :func:`score_map` reads."""
 
     def __init__(self, poses):
         self.map = type("Map", (), {"poses": poses, "n": len(poses), "n_links": len(poses)})
@@ -118,48 +120,50 @@ def ring(n, laps):
     return np.stack([np.cos(angle), np.sin(angle), angle], axis=1)
 
 
-def test_a_closed_map_is_consistent_and_a_heap_or_an_open_one_is_not():
+def test_a_closed_map_is_consistent_and_a_collapsed_or_open_map_is_not():
     none, n = np.empty((0, 0)), 200
     same = np.stack([np.arange(100), np.arange(100, 200)], axis=1)
     other = np.stack([np.arange(100), (np.arange(100) + 150) % 200], axis=1)
     pairs = Revisits(none, 0.0, 0.0, 1, same, other)
-    places, keys = {k: k for k in range(n)}, np.arange(n)
+    experiences, keys = {k: k for k in range(n)}, np.arange(n)
 
-    def off(poses):
-        return judge(BrainConfig(), Mapped(poses), places, keys, pairs).inconsistency
+    def inconsistency(poses):
+        return score_map(BrainConfig(), Mapped(poses), experiences, keys, pairs).inconsistency
 
     generator = np.random.default_rng(0)
     closed = ring(n, 2)
     straight = np.stack([np.arange(n), np.zeros(n), np.zeros(n)], axis=1).astype(float)
-    assert off(closed) == pytest.approx(0.0, abs=1e-9)
-    assert off(7.0 * closed + generator.normal(0, 0.1, closed.shape)) < 0.1  # whatever the scale
-    assert off(generator.normal(0, 1, closed.shape)) == pytest.approx(1.0, abs=0.2)
-    assert off(np.zeros_like(closed)) == 1.0
-    assert off(straight) >= 1.0
+    noisy = 7.0 * closed + generator.normal(0, 0.1, closed.shape)
+    assert inconsistency(closed) == pytest.approx(0.0, abs=1e-9)
+    assert inconsistency(noisy) < 0.1  # at any scale
+    assert inconsistency(generator.normal(0, 1, closed.shape)) == pytest.approx(1.0, abs=0.2)
+    assert inconsistency(np.zeros_like(closed)) == 1.0
+    assert inconsistency(straight) >= 1.0
 
 
-def test_of_maps_about_as_consistent_the_smallest_is_taken():
-    def trial(off, places):
-        return Trial(BrainConfig(), off, 0, places, 0, np.zeros((1, 2)))
+def test_the_smallest_of_equally_consistent_maps_is_chosen():
+    def trial(inconsistency, experiences):
+        return Trial(BrainConfig(), inconsistency, 0, experiences, 0, np.zeros((1, 2)))
 
-    assert best_of([trial(0.040, 900), trial(0.043, 500), trial(0.2, 100)]).n_places == 500
-    assert best_of([trial(0.001, 900), trial(0.005, 500)]).n_places == 500
+    assert best_of([trial(0.040, 900), trial(0.043, 500), trial(0.2, 100)]).n_experiences == 500
+    assert best_of([trial(0.001, 900), trial(0.005, 500)]).n_experiences == 500
 
 
-def test_the_map_gets_better_and_the_config_is_one_that_run_takes(tuned, tmp_path):
+def test_the_map_improves_and_run_accepts_the_config(tuned, tmp_path):
     tuning, out = tuned
     assert tuning.after.inconsistency < 0.03
     assert tuning.after.inconsistency < tuning.before.inconsistency + 0.005
     assert build_config(read_config_file(out / "config.toml")) == tuning.config
-    told = json.loads((out / "tune.json").read_text())
-    assert told["after"]["inconsistency"] == tuning.after.inconsistency
-    assert {change["key"] for change in told["changes"]} >= {"view.threshold", "odometry.fov_deg"}
+    written = json.loads((out / "tune.json").read_text())
+    assert written["after"]["inconsistency"] == tuning.after.inconsistency
+    changed = {change["key"] for change in written["changes"]}
+    assert changed >= {"view.threshold", "odometry.fov_deg"}
     assert (out / "tune.png").stat().st_size > 20_000
     arguments = ["run", PICTURES, "--config", str(out / "config.toml"), "--no-tensorboard"]
     assert main([*arguments, "--stop", "40", "-o", str(tmp_path / "run")]) == 0
 
 
-def test_the_map_found_is_turned_onto_the_map_before_and_figures_are_written_out(tuned):
+def test_the_map_found_is_aligned_with_the_map_before_and_numbers_are_plain(tuned):
     tuning, _ = tuned
     onto = tuning.before.track_xy
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -168,7 +172,7 @@ def test_the_map_found_is_turned_onto_the_map_before_and_figures_are_written_out
     _, templates, _, maps, before, after = figure.get_axes()
     tracks = [axes.get_lines()[0].get_xydata() for axes in (before, after)]
     np.testing.assert_allclose(tracks[1], 1.5 * tracks[0], atol=1e-9)
-    assert after.get_xlabel() == "x (arbitrary unit), turned onto the map before"
+    assert after.get_xlabel() == "x (arbitrary unit), turned to align with the map before"
     scores = {f"{score.average_precision:.3f}" for score in tuning.views}
     assert {text.get_text() for text in templates.texts} <= scores
     render(figure)
@@ -177,7 +181,7 @@ def test_the_map_found_is_turned_onto_the_map_before_and_figures_are_written_out
     assert all(re.fullmatch(r"[\d.]+", tick) for tick in ticks)
 
 
-def test_where_nothing_was_revisited_empty_panels_have_no_axes(tuned):
+def test_without_revisits_empty_panels_have_no_axes(tuned):
     tuning, _ = tuned
     none = tuning.revisits._replace(same=np.empty((0, 2), np.int64))
     figure = plot_tuning(replace(tuning, revisits=none, motion=None, trials=[]), "drive.avi")
@@ -188,9 +192,9 @@ def test_where_nothing_was_revisited_empty_panels_have_no_axes(tuned):
 
 
 def test_the_field_of_view_of_a_rendered_camera_is_found():
-    # Odometry takes all pixels for equal angles. A lens of 90° without distortion has 1.57 rad in
-    # its width, but as if it were 2 rad (115°) in its middle: the best is between the two, or a
-    # little off, as turns are measured in whole pixels.
+    # Odometry assumes equal angles per pixel. A lens of 90° without distortion has 1.57 rad over
+    # its width, but the pixels in its middle are those of 2 rad (115°): the estimate is between the
+    # two, or a little off, as turns are measured in whole pixels.
     drive = read_drive(open_source("world:corridor?laps=2.2"))
     keys = key_frames(drive)
     shifts = measure_shifts(drive.pictures, drive.region(0, 1, 0, 0.5), 40)
@@ -205,17 +209,17 @@ def test_tuning_twice_gives_the_same_config(tuned, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (tuned[1] / name).read_bytes()
 
 
-def test_views_by_a_network_are_tuned_too_and_the_run_has_the_map_that_was_judged(tmp_path):
-    """Each frame is looked at once; what the search saw is what a brain with the network sees."""
+def test_views_by_a_network_are_tuned_too_and_the_run_gives_the_map_of_the_search(tmp_path):
+    """Each frame is encoded once; the search uses the templates of a brain with the network."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         network = nn.Sequential(nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 16, 3, 2, 1))
-    looked = []
-    network.register_forward_hook(lambda *_: looked.append(1))
+    calls = []
+    network.register_forward_hook(lambda *_: calls.append(1))
     size = {"template_width": 16, "template_height": 32, "shift_match": 2}
     config = BrainConfig(view={"features": "module"} | size, max_gap_s=1e9)
     tuning = tune(PICTURES, tmp_path / "out", config, features=network)
-    assert len(looked) == 337
+    assert len(calls) == 337
     assert tuning.after.inconsistency < 0.03
     assert tuning.after.inconsistency < tuning.before.inconsistency + 0.005
     assert [score.config.features for score in tuning.views] == ["module", "grey"]
@@ -224,12 +228,12 @@ def test_views_by_a_network_are_tuned_too_and_the_run_has_the_map_that_was_judge
     brain = NavigationBrain(tuning.config, features=network)
     for frame in open_source(PICTURES).frames():
         brain(frame)
-    assert (brain.view.n, brain.map.n) == (tuning.after.n_views, tuning.after.n_places)
+    assert (brain.view.n, brain.map.n) == (tuning.after.n_templates, tuning.after.n_experiences)
 
 
-def test_a_drive_that_never_comes_back_is_told_so(tmp_path):
+def test_a_drive_without_revisits_is_reported(tmp_path):
     tuning = tune("world:corridor?laps=0.4&width=96&height=48", tmp_path / "out")
-    assert "drive the same way twice" in " ".join(tuning.notes)
+    assert "drive the same route twice" in " ".join(tuning.notes)
     assert [key for key in tuning.changes if key.startswith("view")] == ["view.threshold"]
     assert tuning.config.view.crop is None
     assert math.isnan(tuning.after.inconsistency)
@@ -238,15 +242,15 @@ def test_a_drive_that_never_comes_back_is_told_so(tmp_path):
     )
 
 
-def test_a_picture_that_never_changes_is_one_line(driven):
-    same = [frame._replace(image=driven.frames[0].image) for frame in driven.frames]
+def test_a_picture_that_never_changes_is_one_line(drive):
+    same = [frame._replace(image=drive.frames[0].image) for frame in drive.frames]
     with pytest.raises(SourceError, match="only 0 of 561 pictures differ"):
-        key_frames(driven.__class__(same, driven.factor, driven.size, 0))
+        key_frames(replace(drive, frames=same))
 
 
-def test_a_camera_that_hardly_moves_is_told_so(driven):
-    noise = np.random.default_rng(0).integers(0, 3, (120, *driven.frames[0].image.shape))
-    pictures = driven.frames[0].image + noise.astype(np.uint8)
+def test_a_camera_at_rest_has_hardly_any_revisits(drive):
+    noise = np.random.default_rng(0).integers(0, 3, (120, *drive.shape))
+    pictures = drive.frames[0].image + noise.astype(np.uint8)
     revisits = find_revisits(pictures)
     assert len(revisits.same) < 30
     assert len(revisits.other) > 0
@@ -256,14 +260,15 @@ def test_regions_are_in_pixels_of_the_source():
     drive = read_drive(open_source("world:ellipse?laps=0.3&width=480&height=240"))
     assert (drive.factor, drive.size, drive.frames[0].image.shape) == (3, (480, 240), (80, 160))
     region = drive.region(0, 1, 0, 0.5)
-    assert drive.in_source(region) == (0, 480, 0, 120)
-    assert drive.here(drive.in_source(region)) == region
+    assert drive.shape == (80, 160)
+    assert drive.to_source(region) == (0, 480, 0, 120)
+    assert drive.to_reduced(drive.to_source(region)) == region
 
 
-def test_what_cannot_be_tuned_is_one_line(tmp_path, capsys):
+def test_input_that_cannot_be_tuned_is_refused_in_one_line(tmp_path, capsys):
     with pytest.raises(SourceError, match="20 frames with a picture; tuning needs 100"):
         tune("world:ellipse?width=64&height=32", tmp_path / "a", stop=20)
-    with pytest.raises(RunError, match="which needs pose"):
+    with pytest.raises(RunError, match="expected pose"):
         tune("world:ellipse", tmp_path / "a", build_config(read_preset("slrb")))
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file"):
@@ -275,15 +280,13 @@ def test_what_cannot_be_tuned_is_one_line(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("name", "frames_a_lap"), [("circuit_launch", 490)])
-def test_a_real_track_closes_from_the_defaults_without_a_number_typed(
-    shared, tmp_path, name, frames_a_lap
-):
+def test_a_real_track_closes_from_the_defaults(shared, tmp_path, name, frames_a_lap):
     source = shared / "data" / name / "frames.tar"
     if not source.exists():
         pytest.skip(f"no {name} beside the checkout")
     tuning = tune(source, tmp_path / "out")
     apart = np.abs(np.diff(tuning.keys[tuning.revisits.same], axis=1)) / frames_a_lap
-    assert np.quantile(np.abs(apart - np.rint(apart)), 0.95) < 0.1  # laps, and nothing else
+    assert np.quantile(np.abs(apart - np.rint(apart)), 0.95) < 0.1  # whole laps
     assert tuning.after.inconsistency < 0.03
     x, y = tuning.after.track_xy.T
     lap = np.abs(x[:-frames_a_lap] - x[frames_a_lap:]) + np.abs(

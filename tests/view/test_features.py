@@ -30,7 +30,7 @@ def texture(seed=0, height=64, width=96):
 
 
 def filters(seed=0, channels=16):
-    """Two layers that halve the picture four times, with weights of their own."""
+    """Two layers that halve the image four times, with weights of their own."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return nn.Sequential(
@@ -79,15 +79,15 @@ def test_brightness_of_features_does_not_matter_and_silence_is_grey():
 @pytest.mark.parametrize("grey", [False, True])
 def test_a_place_is_learnt_once_and_recognised_after(grey):
     cells = LocalViewCells(ViewConfig(**SMALL), filters())
-    pictures = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
-    first, again = [[cells(p) for p in pictures] for _ in range(2)]
+    images = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
+    first, again = [[cells(p) for p in images] for _ in range(2)]
     assert [m.template for m in first] == [m.template for m in again] == list(range(6))
     assert all(m.is_new for m in first)
     assert all(m.error == 0.0 for m in again)
     assert cells(np.full((64, 96), 9, np.uint8)).template == -1  # it shows nothing
 
 
-def test_a_shifted_picture_is_recognised_within_the_range():
+def test_a_shifted_image_is_recognised_within_the_range():
     cells = LocalViewCells(ViewConfig(**SMALL, threshold=0.03), filters())
     wide = texture(3, width=256 + 128)
     cells(wide[:, 64:320])
@@ -100,11 +100,11 @@ def test_a_turned_panorama_is_a_rolled_template(turn):
     """Exactly, where a column of the template is one of the features: edges are not seen."""
     config = ViewConfig(**SMALL | {"shift_match": 0}, panoramic=True)
     cells = LocalViewCells(config, filters())
-    picture = texture(2, width=16 * 16)
-    ahead, turned = cells.encode(picture), cells.encode(np.roll(picture, -16 * turn, axis=1))
+    image = texture(2, width=16 * 16)
+    ahead, turned = cells.encode(image), cells.encode(np.roll(image, -16 * turn, axis=1))
     np.testing.assert_allclose(turned, np.roll(ahead, -turn, axis=1), atol=1e-5)
-    cells(picture)
-    match = cells(np.roll(picture, -16 * turn, axis=1))
+    cells(image)
+    match = cells(np.roll(image, -16 * turn, axis=1))
     assert not match.is_new
     assert match.relative_heading_rad == pytest.approx(-2 * math.pi * turn / 16)
 
@@ -148,9 +148,9 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
     [
         ("squeezenet1_1", "none.pth", "no such file"),
         ("squeezenet1_1", "text.pth", "cannot be read; expected the state_dict"),
-        ("squeezenet1_1", "list.pth", "holds no state_dict"),
-        ("squeezenet9", "squeezenet.pth", "near it are squeezenet1_1"),
-        ("squeezenet1_1.features.77", "squeezenet.pth", "its parts are features, classifier"),
+        ("squeezenet1_1", "list.pth", "contains no state_dict"),
+        ("squeezenet9", "squeezenet.pth", "similar names: squeezenet1_1"),
+        ("squeezenet1_1.features.77", "squeezenet.pth", "after its name: features, classifier"),
         ("resnet18", "squeezenet.pth", "not of resnet18"),
     ],
 )
@@ -166,7 +166,7 @@ def test_what_is_wrong_with_weights_is_said(features, weights, said, squeezenet)
     ("view", "said"),
     [
         ({"features": "resnet18"}, "features resnet18 needs weights"),
-        ({"weights": "a.pth"}, "weights are of a named network, and features is grey"),
+        ({"weights": "a.pth"}, "weights belong to a named network, but features is grey"),
         ({"features": "module", "weights": "a.pth"}, "and features is module"),
     ],
 )
@@ -187,11 +187,11 @@ class Gives(nn.Module):
 @pytest.mark.parametrize(
     ("found", "error", "said"),
     [
-        (torch.zeros(1, 4, 5), ConfigError, r"gives \(1, 4, 5\); expected features"),
-        ({"out": 1}, ConfigError, "gives dict; expected features"),
+        (torch.zeros(1, 4, 5), ConfigError, r"returns \(1, 4, 5\); expected features"),
+        ({"out": 1}, ConfigError, "returns dict; expected features"),
         (torch.zeros(1, 4, 3, 5, dtype=torch.int64), ConfigError, "expected features"),
-        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "not all finite"),
-        (nn.Conv2d(3, 4, 200), ConfigError, "fails on a picture of 96x64 px"),
+        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "are not finite"),
+        (nn.Conv2d(3, 4, 200), ConfigError, "fails on an image of 96x64 px"),
     ],
 )
 def test_what_is_wrong_with_a_network_is_said(found, error, said):
@@ -243,7 +243,9 @@ def test_a_brain_says_which_network_it_needs(tour, tmp_path):
     brain = lived(tour[:50], filters())
     save_brain(brain, path)
     assert load_brain(path).map.n == brain.map.n  # to look at it, no network is needed
-    with pytest.raises(ConfigError, match=r"none was passed; pass it .*load_brain\(path, feat"):
+    with pytest.raises(
+        ConfigError, match=r"no network was passed; pass it .*load_brain\(path, feat"
+    ):
         load_brain(path)(tour[50])
     with pytest.raises(ConfigError, match="views of the map were made with other weights"):
         load_brain(path, features=filters(seed=1))(tour[50])
@@ -310,7 +312,7 @@ def weights_of(name, folder):
 def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(tmp_path):
     path = weights_of("swin_t", tmp_path)
     assert load_network("swin_t", path)(torch.rand(1, 3, 96, 192)).shape == (1, 768, 7, 14)
-    with pytest.raises(ConfigError, match=r"channels last; name swin_t\.permute"):
+    with pytest.raises(ConfigError, match=r"channels last; use swin_t\.permute"):
         load_network("swin_t.features", path)
 
 
@@ -328,7 +330,7 @@ class Transformer(nn.Module):
 
 
 def test_a_network_that_only_takes_its_own_size_is_one_line():
-    with pytest.raises(ConfigError, match=r"fails on a picture of 96x64 px \(Wrong image width!"):
+    with pytest.raises(ConfigError, match=r"fails on an image of 96x64 px \(Wrong image width!"):
         FeatureEncoder(ViewConfig(**SMALL), Transformer())(texture())
 
 

@@ -51,7 +51,7 @@ def assert_exact(cells, views):
 def always_pruned(monkeypatch):
     """Small memories are searched as large ones: by bounds, and in parts."""
     monkeypatch.setattr(search, "PRUNE_FROM", 100)
-    monkeypatch.setattr(search, "_AT_ONCE", 64)
+    monkeypatch.setattr(search, "_BATCH", 64)
 
 
 def stored(cells):

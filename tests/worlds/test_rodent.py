@@ -96,7 +96,7 @@ def test_rows_without_numbers_or_with_a_time_that_does_not_rise_are_dropped_and_
     ("text", "says"),
     [
         ("", "is empty; expected time_s,x_m,y_m: seconds and metres"),
-        ("time_s,x_m,y_m\n", "has a header and no lines"),
+        ("time_s,x_m,y_m\n", "has a header, but no lines"),
         ("time_s,x_m\n0,1\n", "has the columns time_s,x_m and no y_m"),
         ("time_s,x_m,y_m\n0,1,here\n", "line 2: y_m is 'here'; expected a number"),
         ("time_s,x_m,y_m\n0,1,1\n", "1 of its 1 rows have numbers and a time that rises"),
@@ -122,7 +122,7 @@ def test_a_damaged_or_missing_npz_is_refused(tmp_path):
     refused(lambda: read_walk(path))
     np.savez(path, **walk)
     path.write_bytes(path.read_bytes()[:100])
-    assert "is not a whole .npz" in refused(lambda: read_walk(path))
+    assert "is damaged or incomplete" in refused(lambda: read_walk(path))
 
 
 def test_a_walk_of_wrong_shape_or_order_is_refused():
