@@ -26,8 +26,8 @@ def test_the_python_runs_and_closes_a_loop(tmp_path, monkeypatch, capsys):
     (program,) = blocks("python")
     exec(compile(program, "README.md", "exec"), {})
     printed = capsys.readouterr().out
-    assert "back at place" in printed
-    assert "way to place 10: [" in printed
+    assert "loop closed at experience" in printed
+    assert "path to experience 10: [" in printed
     assert (tmp_path / "brain.safetensors").exists()
 
 

@@ -1,4 +1,4 @@
-"""The brain: odometry, views, a map and populations of cells; one frame in, one result out."""
+"""The brain: odometry, views, a map and populations of cells, advanced frame by frame."""
 
 import math
 from collections.abc import Sequence
@@ -33,16 +33,16 @@ BLIND = ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
 
 
 class Accepted(NamedTuple):
-    """A frame that the brain takes, and what was found in it; nothing has changed yet.
+    """A checked frame and the observations in it; the state has not changed yet.
 
     Attributes:
         frame: As the source delivered it.
-        view: Its view, encoded; ``None``: it shows nothing.
-        observed: What each population found, by kind.
-        velocity: Measured, or by visual odometry.
+        view: Its encoded view; ``None``: no image, or one without contrast.
+        observed: Observation of each population, by kind.
+        velocity: Self-motion, measured or from visual odometry.
         dt_s: Time since the last frame.
-        profiles: For the visual odometry of the next frame; ``None``: it was not used.
-        gap: The time since the last frame is too long for the map to go on.
+        profiles: Profiles for the visual odometry of the next frame; ``None``: not used.
+        gap: The time since the last frame exceeds ``max_gap_s``: a new map begins.
     """
 
     frame: Frame
@@ -55,19 +55,19 @@ class Accepted(NamedTuple):
 
 
 class NavigationBrain(BrainState):
-    """A stream of frames becomes a map of experiences, by any set of populations side by side.
+    """Maps a stream of frames with any set of populations.
 
-    ``odometry``, ``view`` and ``map`` are modules that can be used alone; so are the populations
-    that ``config.cells`` names, each an attribute: ``pose_cells`` (RatSLAM), ``navigation``
-    (SLRB), ``semantic`` (SSP-SLAM), or your own. One of them leads: it decides about experiences.
-    All have one belief of where the robot is: self-motion and their own senses move it, memory
-    corrects it, and corrections are exchanged; see :mod:`neuroslam.state.population`.
-    ``state_dict`` holds everything: a brain that is saved, loaded and goes on is bit-equal to one
-    that never stopped.
+    ``odometry``, ``view`` and ``map`` are modules that can be used alone, and so are the
+    populations named in ``config.cells``, each an attribute: ``pose_cells`` (RatSLAM),
+    ``navigation`` (SLRB), ``semantic`` (SSP-SLAM), ``head_direction``, ``speed`` or your own. One
+    of them leads: it decides about experiences. Every population estimates the pose from
+    self-motion and its own senses, corrects it from memory, and receives the corrections of the
+    others; see :mod:`neuroslam.state.population`. ``state_dict`` holds the complete state: a brain
+    that was saved and loaded continues bit for bit like one that never stopped.
 
     Args:
-        config: Every parameter; the defaults suit a forward camera on a small robot.
-        features: Network that makes views, where ``config.view.features`` is ``"module"``; see
+        config: All parameters; the defaults suit a forward camera on a small robot.
+        features: Network that computes views, if ``config.view.features`` is ``"module"``; see
             :class:`~neuroslam.view.features.FeatureEncoder`.
 
     Example:
@@ -89,12 +89,10 @@ class NavigationBrain(BrainState):
         """Advance by one frame.
 
         Raises:
-            BadFrame: If the frame's time does not follow the last one's, or it holds what cannot
-                be, or there is nothing to tell motion from. Nothing has changed then, and the brain
-                can go on with another frame; after a gap the one after next is taken, if it
-                follows.
-            MapError: If it would take the robot out of the space of a population; nothing has
-                changed then either.
+            BadFrame: If the time does not increase, the data is invalid, or there is neither
+                odometry nor an image. The state is unchanged, and another frame can follow; after
+                a gap, the second frame is accepted.
+            MapError: If the robot would leave the space of a population; the state is unchanged.
         """
         accepted = self._accept(frame)
         now = self._enter(accepted)
@@ -122,7 +120,7 @@ class NavigationBrain(BrainState):
         return self._finish(accepted, now, decision, cells)
 
     def _accept(self, frame: Frame) -> Accepted:
-        """Find in a frame what the brain has cells for; whatever is refused is refused here."""
+        """Check a frame and compute its observations; every refusal happens here."""
         try:
             dt_s = self._elapsed(frame)
             observed = dict.fromkeys(self._populations)
@@ -137,7 +135,7 @@ class NavigationBrain(BrainState):
                 view = self.view.usable_view(frame.image)
             velocity, profiles = self._velocity(frame, dt_s)
             gap = dt_s > self.config.max_gap_s
-            if not gap and self._with["check"]:  # after a gap there is another map
+            if not gap and self._with["check"]:  # after a gap a new map begins
                 self._check(frame, observed, Motion(*velocity, dt_s))
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
@@ -150,7 +148,7 @@ class NavigationBrain(BrainState):
             population.check(now, observed[population.kind], belief)
 
     def _enter(self, accepted: Accepted) -> StepInput:
-        """Begin a frame: recognise its view, on a new map where the robot did not drive there."""
+        """Begin a frame: start a new map after a gap or a kidnapping, and match the view."""
         frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)
@@ -159,7 +157,7 @@ class NavigationBrain(BrainState):
         if gap or kidnapped:
             self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
-                velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
+                velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
         match = BLIND if view is None else self.view.match_or_learn(view)
@@ -168,7 +166,7 @@ class NavigationBrain(BrainState):
         return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
-        """Let the map and all populations follow corrections, but for their authors."""
+        """Apply corrections to the map and to all populations but their authors."""
         some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
@@ -184,7 +182,7 @@ class NavigationBrain(BrainState):
     def _finish(
         self, accepted: Accepted, now: StepInput, decision: Decision, cells: PoseEstimate
     ) -> StepResult:
-        """End a frame: count it, and join a stored map where it is surely recognised."""
+        """End a frame: count it, and join a stored map if enough experiences are recognised."""
         frame, view, (action, experience) = accepted.frame, now.view, decision
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
@@ -211,7 +209,7 @@ class NavigationBrain(BrainState):
         )
 
     def _name_session(self, frame: Frame, observed: dict[str, Any]) -> None:
-        """Open a session; its id follows from what it begins with."""
+        """Open a session; its id is a hash of config, source and first frame."""
         found: list[Any] = []
         for observation in observed.values():
             found += observation if isinstance(observation, tuple) else [observation]
@@ -241,7 +239,7 @@ class NavigationBrain(BrainState):
         dt_s = frame.time_s - self.clock.time_s
         if not dt_s > 0.0:  # NaN too
             raise BadFrame(
-                f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s "
+                f"time {float(frame.time_s)} s does not follow {self.clock.time_s} s "
                 f"of frame {self.clock.frame}; times must rise"
             )
         if dt_s > self.config.max_gap_s and self.config.sessions.after_gap == "new_map":
@@ -249,11 +247,12 @@ class NavigationBrain(BrainState):
         if dt_s > self.config.max_gap_s:
             since_s = frame.time_s - self._after_gap_s
             if 0.0 < since_s <= self.config.max_gap_s:
-                return float(since_s)  # the gap is real: what was missed in it stays unknown
+                return float(since_s)  # the gap is real; the motion in it stays unknown
             self._after_gap_s = float(frame.time_s)
             raise BadFrame(
-                f"{dt_s:g} s after frame {self.clock.frame}, more than "
-                f"max_gap_s = {self.config.max_gap_s:g}; raise it if the gap is real"
+                f"{round(float(dt_s), 6)} s after frame {self.clock.frame}; expected at most "
+                f"max_gap_s = {self.config.max_gap_s} s; raise it, or set sessions.after_gap = "
+                "'new_map', if the gap is real"
             )
         return float(dt_s)
 

@@ -1,4 +1,4 @@
-"""What a brain is made of: modules, populations, sessions, and maps that are stored or merged."""
+"""State of a brain: modules, populations, sessions, and stored maps."""
 
 import math
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class Clock(Scalars, AboutNow):
-    """Frame and time the brain is at."""
+    """Present frame and time."""
 
     frame: int
     time_s: float
@@ -49,18 +49,18 @@ class Clock(Scalars, AboutNow):
 
 
 class BrainState(nn.Module):
-    """State of a brain and what becomes of it between frames; abstract: it takes no frames itself.
+    """State of a brain, its merging and its stored maps; a subclass processes frames.
 
     Args:
-        config: Every parameter.
-        features: Network that makes views, where ``config.view.features`` is ``"module"``.
+        config: All parameters.
+        features: Network that computes views, if ``config.view.features`` is ``"module"``.
     """
 
     clock: Clock
     odometry: VisualOdometry
     view: LocalViewCells
     map: ExperienceMap
-    # Populations of the package, where config.cells names them:
+    # Populations of the package, if config.cells names them:
     pose_cells: "PoseCellNetwork"
     navigation: "NavigationCells"
     semantic: "SemanticCells"
@@ -78,13 +78,10 @@ class BrainState(nn.Module):
         super().__init__()
         self.config = config or BrainConfig()
         self._encoder = view_encoder(self.config.view, features)
-        self.about: tuple[str, str, str] = (
-            "",
-            "",
-            "",
-        )  # source, preset and date of the next session
+        # Source, preset and date of the next session.
+        self.about: tuple[str, str, str] = ("", "", "")
         self._detects = self.config.sessions.kidnapped == "detect"
-        self._after_gap_s = -math.inf  # time of a frame that was refused for a gap before it
+        self._after_gap_s = -math.inf  # time of a frame that was refused after a gap
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
         self.stored = ModulesOf()
         self._begin()
@@ -109,7 +106,7 @@ class BrainState(nn.Module):
         self._changed()
 
     def _changed(self) -> None:
-        """Collect the populations anew, and forget what follows from the stored maps."""
+        """Update what is derived from populations and stored maps."""
         self._stored_views: StoredViews | None = None
         classes = population_classes(self.config)
         self._populations: dict[str, Population] = {
@@ -117,7 +114,7 @@ class BrainState(nn.Module):
         }
         leader = leading_class(self.config)
         self._leads = leader.kind
-        # A hook is called where a population has its own: most have few.
+        # Only overridden hooks are called.
         self._with = {
             hook: [p for p in self._populations.values() if _overrides(type(p), hook)]
             for hook in ("observe", "check", "step", "vetoes", "follow", "learn", "recall")
@@ -131,7 +128,7 @@ class BrainState(nn.Module):
 
     @property
     def populations(self) -> dict[str, Population]:
-        """The populations by kind, in the order in which they step."""
+        """The populations by kind, in the order of their steps."""
         return self._populations
 
     @property
@@ -140,21 +137,21 @@ class BrainState(nn.Module):
         return self._populations[self._leads]
 
     def parts(self) -> dict[str, Mergeable]:
-        """Return the parts that the state is made of, by name."""
+        """Return the parts of the state, by name."""
         return {name: p for name, p in self.named_children() if isinstance(p, Mergeable)}
 
     def merge(self, partial: Self, match: Match) -> tuple[Self | None, MergeReport]:
         """Merge the map of another session into this one; neither brain is altered.
 
         Args:
-            partial: The brain whose session goes on: its activity, time and odometry are kept.
-            match: Where the two maps meet, as :func:`~neuroslam.merging.match.find_match` tells.
+            partial: The brain whose session continues; its activity, time and odometry are kept.
+            match: Match of the two maps, from :func:`~neuroslam.merging.match.find_match`.
 
         Returns:
-            The merged brain, or ``None`` where the merge is refused, and the report.
+            The merged brain, or ``None`` if the merge is refused, and the report.
 
         Raises:
-            MapError: If the match names experiences that are not there.
+            MapError: If the match names experiences that do not exist.
         """
         state, _, report = merge(self, partial, match)
         if state is None:
@@ -173,21 +170,20 @@ class BrainState(nn.Module):
         return merged, report
 
     def store(self, other: Self) -> None:
-        """Remember the maps of another brain; when one is recognised, it is joined to this map.
+        """Store the maps of another brain; each is joined to this map once it is recognised.
 
         Args:
-            other: It is not altered; the maps that it has stored itself are taken too.
+            other: The other brain, which is not altered; its own stored maps are stored too.
 
         Raises:
-            ConfigError: If views or pose cells of the two were made with different configs, or
-                views by another network.
+            ConfigError: If the configs of views or populations differ, or the networks of views.
         """
         self.view.load_network()
         apart = differing(self, other)
         if apart:
             raise ConfigError(
-                f"a stored map was made with another config: {'; '.join(apart)}; "
-                "run with the stored map's config"
+                f"the stored map has another config: {'; '.join(apart)}; "
+                "run with the config of the stored map"
             )
         for one in (other, *other.stored):
             if one.map.n:
@@ -200,24 +196,24 @@ class BrainState(nn.Module):
         for i, before in enumerate(self.stored):
             shared = shared_history(before, copy)
             merged = before.merge(copy, shared.match)[0] if shared and shared.match else None
-            if merged is not None:  # what became of one map in two sessions
+            if merged is not None:  # two continuations of one map
                 self.stored[i] = merged
                 return
         self.stored.append(copy)
         self.recognition.store()
 
     def start_new_map(self, why: str = "kidnapped") -> None:
-        """Go on with an empty map, for the robot is no longer where it was.
+        """Store the present map and continue with an empty one, as after a kidnapping.
 
-        The map so far is stored; it is joined again when a place of it is recognised.
+        The stored map is joined again once it is recognised.
 
         Args:
-            why: ``kidnapped``, or ``gap``; kept with the new session.
+            why: ``kidnapped`` or ``gap``; stored with the new session.
         """
         if not self.map.n:
             return
         before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
-        senses = self.odometry, self.continuity  # they go on: this frame is the next one's before
+        senses = self.odometry, self.continuity  # kept: they compare successive frames
         kept = type(self)(self.config)
         kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
@@ -239,7 +235,7 @@ class BrainState(nn.Module):
         self._open(session)
 
     def restore(self, state: State, stored: Sequence[Self]) -> None:
-        """Go on with another state, and with these stored maps."""
+        """Replace the state and the stored maps."""
         self._begin()
         self.stored = ModulesOf(stored)
         own = {name: value for name, value in state.items() if not name.startswith("stored.")}
@@ -257,7 +253,7 @@ class BrainState(nn.Module):
         self.map.state.session = session.id
 
     def _recognise(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
-        """Join a stored map if this place is surely one of it."""
+        """Join a stored map if enough recent experiences match it."""
         config, recognition = self.config.sessions, self.recognition
         if not len(self.stored):
             return False
@@ -295,7 +291,7 @@ class BrainState(nn.Module):
         """Join stored map ``where``, and then those that share a session with it."""
         rest = [one for i, one in enumerate(self.stored) if i != where]
         loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
-        self.stored = ModulesOf()  # what else is stored is neither copied nor looked at
+        self.stored = ModulesOf()  # the other stored maps are not copied
         merged, report = loaded.merge(self, match)
         self.stored = everything
         report.at_frame = frame.index
@@ -321,7 +317,7 @@ class BrainState(nn.Module):
         return True
 
     def not_joined(self) -> list[dict[str, object]]:
-        """Say of each stored map how much of it was recognised, for the report of a run."""
+        """Return for each stored map how much of it was recognised, for the report of a run."""
         tally, needed = self.recognition.tally, self.config.sessions.confirm
         return [
             {
@@ -329,11 +325,10 @@ class BrainState(nn.Module):
                 "experiences": one.map.n,
                 "places_that_look_alike": alike,
                 "places_that_agree": agreed,
-                "reason": "maps without views are laid on each other when they are finished: "
-                "neuroslam merge"
+                "reason": "maps without views are merged when they are finished: neuroslam merge"
                 if not self._makes_views
-                else f"{counted(alike, 'place')} looked like one of it, {agreed} at most agreed on "
-                f"how the maps lie; {needed} must",
+                else f"{counted(alike, 'experience')} matched by view, at most {agreed} agreed on "
+                f"the alignment; expected {needed}",
             }
             for one, alike, agreed in zip(
                 self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
@@ -342,17 +337,17 @@ class BrainState(nn.Module):
 
     @property
     def landmarks_m(self) -> np.ndarray | None:
-        """Points that populations want drawn on the map, ``(n, 2)``; ``None``: none has any."""
+        """Points that populations draw on the map, ``(n, 2)`` in metres; ``None``: no points."""
         points = [p.points_m() for p in self._populations.values()]
         known = [rows for rows in points if rows is not None]
         return np.concatenate(known) if known else None
 
     def place(self, experience: int, offset: Pose) -> Pose:
-        """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.
+        """Return the pose on the present map of a robot at ``offset`` from an experience.
 
         Args:
             experience: Id, or -1 for the origin before the first experience.
-            offset: Pose relative to that experience, as ``map.offset`` gave it at the time.
+            offset: Pose relative to that experience, the ``map.offset`` at that time.
         """
         if experience < 0:
             return offset
@@ -364,7 +359,7 @@ def _overrides(population: type[Population], hook: str) -> bool:
 
 
 def _make_stored(module: BrainState, state: State, prefix: str, *_unused: object) -> None:
-    """Make as many stored maps as a state has."""
+    """Create as many stored maps as a state has."""
     inside = f"{prefix}stored."
     numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
     if len(numbers) != len(module.stored):

@@ -154,7 +154,8 @@ class VisualOdometry(AboutNow):
         super().__init__()
         self.config = config
         self.size = _Size(height=0, width=0)
-        self._regions: tuple[Region, Region] | None = None  # derived from the config and the size
+        # Regions are derived from the config and the size of an image.
+        self._regions: tuple[tuple[int, int], tuple[Region, Region]] | None = None
         self.register_buffer("speed_sums", torch.zeros(0, dtype=torch.int32))
         self.register_buffer("turn_sums", torch.zeros(0, dtype=torch.int32))
         self.register_load_state_dict_pre_hook(_resize_to_saved)
@@ -195,9 +196,9 @@ class VisualOdometry(AboutNow):
                 f"VisualOdometry: image is {width} x {height} px; expected "
                 f"{self.size.width} x {self.size.height} px as in the frames before it"
             )
-        if self._regions is None:
-            self._regions = regions_in(height, width, self.config)
-        speed_region, turn_region = self._regions
+        if self._regions is None or self._regions[0] != (height, width):
+            self._regions = (height, width), regions_in(height, width, self.config)
+        speed_region, turn_region = self._regions[1]
         now = Profiles(
             height, width, column_sums(image, speed_region), column_sums(image, turn_region)
         )

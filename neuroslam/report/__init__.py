@@ -1,4 +1,4 @@
-"""One page that explains a finished run: all that a browser needs is in the file."""
+"""The report page of a finished run: one HTML file without external resources."""
 
 from neuroslam.report.page import write_report
 

@@ -1,5 +1,5 @@
 "use strict";
-// What cells did: the packet's path on the torus of the pose cells, its shape at the end, place cells.
+// Cells: path of the packet on the torus of the pose cells, activity at the end, place cells.
 
 const TRAIL_S = 20;
 
@@ -27,7 +27,7 @@ function makePanel(title, note, paint, aspect, box = null) {
   return panel;
 }
 
-// Axes of a square or oblong field; returns where its values lie on the canvas.
+// Draws axes; returns functions from values to canvas coordinates.
 function axes(pen, width, height, [x0, x1], [y0, y1], across, up) {
   const box = { left: 44, right: 12, top: 8, bottom: 34 };
   const x = (value) => box.left + ((value - x0) / (x1 - x0)) * (width - box.left - box.right);
@@ -160,16 +160,16 @@ function paintPlaceCells(pen, width, height) {
 function startCells() {
   if (about.cells.includes("pose")) {
     if (known.rows) {
-      const note = `Its path over the torus in the last ${TRAIL_S} s up to the frame; the arrow is its heading. Edges meet. Dots: where places are bound.`;
+      const note = `Path of the packet over the torus in the last ${TRAIL_S} s; the arrow is its heading. Opposite edges are neighbours. Dots: bindings of experiences.`;
       const panels = [makePanel("Packet of the pose cells", note, paintTorus, 0.95), makePanel("Pose cells, the last " + TRAIL_S + " s", note, paintTorus, 0.95, $("now-cells"))];
       watch("row", () => panels.forEach((panel) => panel.follow()));
     }
-    makePanel("Activity at the end of the run", "Left summed over heading, right over y; yellow is most. A run keeps the activity of its end only.", paintActivity, 0.62);
+    makePanel("Activity at the end of the run", "Left summed over heading, right over y; yellow is the peak. A run stores only the final activity.", paintActivity, 0.62);
   }
   if (about.cells.includes("place")) {
     const cells = run.cell_x_m.length, walls = run.wall_x_m.length;
     let longest = 0;
     for (const seconds of run.cell_time_s) longest = Math.max(longest, seconds);
-    makePanel("Place cells", `${many(cells, "place cell")}, yellow where the animal spent longest (${duration(longest)}); grey strokes: ${many(walls, "remembered stretch")}${walls === 1 ? "" : "es"} of wall.`.replace("stretchs", "stretch"), paintPlaceCells, 0.9);
+    makePanel("Place cells", `${many(cells, "place cell")}, coloured by the time spent there (yellow: ${duration(longest)}); grey: ${many(walls, "remembered part")} of walls.`, paintPlaceCells, 0.9);
   }
 }

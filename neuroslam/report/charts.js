@@ -1,5 +1,5 @@
 "use strict";
-// Curves over time, with a mark at the frame of the slider.
+// Charts over time, with a mark at the current frame.
 
 const CHART = { left: 54, right: 10, top: 6, bottom: 18 };
 
@@ -10,12 +10,12 @@ function timeSpan() {
 
 // One chart: series of { name, colour, value(row), dots, of(row) } with rows in `at` or all of them.
 function makeChart(title, unit, height, series, { low = null, high = null, limit = null, digits = 2, step = null } = {}) {
-  const told = series.map((one) => make("b", { text: "" }));
+  const readouts = series.map((one) => make("b", { text: "" }));
   const head = make("div", { class: "head" }, make("h3", { text: title }), unit ? make("span", { text: unit }) : null,
     ...series.map((one, i) => {
       const key = make("i", { class: one.dots ? "key-dot" : "key-line" });
       one.key = key;
-      return make("span", {}, key, one.name, told[i]);
+      return make("span", {}, key, one.name, readouts[i]);
     }));
   const canvas = make("canvas", { role: "img", "aria-label": `${title}: ${series.map((one) => one.name).join(", ")}` });
   const now = make("div", { class: "now" });
@@ -93,7 +93,7 @@ function makeChart(title, unit, height, series, { low = null, high = null, limit
         let at = chosen.row;
         if (one.at) at = lastNotAbove(one.at, chosen.row);
         const value = one.value(at);
-        told[i].textContent = value === value ? value.toFixed(one.digits ?? digits) : "–";
+        readouts[i].textContent = value === value ? value.toFixed(one.digits ?? digits) : "–";
       });
     },
   };
@@ -113,7 +113,7 @@ function drawSeries(pen, one, chart) {
   pen.strokeStyle = pen.fillStyle = one.colour();
   if (one.dots) {
     const size = n > 4000 ? 1.6 : n > 1000 ? 2.4 : 3.4;
-    let column = -1, taken = null;  // a dot that hides another is drawn once
+    let column = -1, taken = null;  // dots on the same pixel are drawn once
     for (let i = 0; i < n; i++) {
       const value = one.value(i);
       if (!(value === value)) continue;
@@ -125,7 +125,7 @@ function drawSeries(pen, one, chart) {
     }
     return;
   }
-  // Of all values in a column of the screen the least and the most are enough.
+  // In each column of pixels only the least, the greatest and the last value are drawn.
   pen.lineWidth = 1.4;
   pen.lineJoin = "round";
   pen.beginPath();
@@ -163,23 +163,23 @@ function startCharts() {
   const column = (name) => (i) => run[name][i], none = NaN, limit = about.threshold;
   const error = run.row_match_error;
   if (run.templates.shape[0]) {
-    add("Recognition", "match error: difference to the nearest template", 130, [
+    add("View matches", "match error: mean difference to the nearest template, 0 to 1", 130, [
       { name: "known view", dots: true, digits: 3, colour: () => colours.map, value: (i) => (error[i] >= 0 && error[i] <= limit ? error[i] : none) },
       { name: "new view", dots: true, digits: 3, colour: () => colours.loop, value: (i) => (error[i] > limit ? error[i] : none) },
     ], { low: 0, limit });
-    add("Templates", "that each frame showed, by number", 110, [
+    add("Templates", "matched template of each frame, by id", 110, [
       { name: "template", dots: true, digits: 0, colour: () => colours.map, value: (i) => (run.row_template[i] >= 0 ? run.row_template[i] : none) },
     ], { low: 0 });
   }
   const here = (action) => (i) => (run.row_place[i] >= 0 && run.row_action[i] === action ? run.row_place[i] : none);
-  add("Places", "that each frame was at, by number on the final map; a step down is a known place", 150, [
-    { name: "at the same place", dots: true, digits: 0, colour: () => colours.odometry, value: here(0) },
+  add("Experiences", "current experience of each frame, by id on the final map; a step down is a revisit", 150, [
+    { name: "unchanged", dots: true, digits: 0, colour: () => colours.odometry, value: here(0) },
     { name: "new", dots: true, digits: 0, colour: () => colours.map, value: here(1) },
-    { name: "came back", dots: true, digits: 0, colour: () => colours.loop, value: (i) => (run.row_action[i] >= 2 && run.row_place[i] >= 0 ? run.row_place[i] : none) },
+    { name: "revisit", dots: true, digits: 0, colour: () => colours.loop, value: (i) => (run.row_action[i] >= 2 && run.row_place[i] >= 0 ? run.row_place[i] : none) },
   ], { low: 0 });
-  add("Memory", "counts", 110, [
+  add("Size of the map", "counts", 110, [
     { name: "links", digits: 0, colour: () => colours.loop, value: column("row_n_links") },
-    { name: "places", digits: 0, colour: () => colours.map, value: column("row_n_experiences") },
+    { name: "experiences", digits: 0, colour: () => colours.map, value: column("row_n_experiences") },
     ...(run.templates.shape[0] ? [{ name: "templates", digits: 0, colour: () => colours.path, value: column("row_n_templates") }] : []),
   ], { low: 0 });
   const [nXY, nTheta] = about.torus;
@@ -195,11 +195,11 @@ function startCharts() {
   const curve = (name, title, unit, colour, settings) => {
     if (run[`${name}_row`] && (name === "doubt_s" || run[`${name}_value`].some((value) => value))) add(title, unit, 80, [{ name: "", at: run[`${name}_row`], digits: 3, colour, value: column(`${name}_value`) }], settings);
   };
-  curve("doubt_s", "Doubt about the place", "seconds; while walls contradict the map it grows", () => colours.match, { low: 0 });
-  curve("peak", "Largest activity of a pose cell", "share of all activity", () => colours.path, { low: 0 });
-  curve("largest_correction", "Relaxation", "largest correction of the map in a frame, m or rad", () => colours.second, { low: 0 });
-  add("Motion", "speed, m/s", 90, [{ name: "v", colour: () => colours.map, value: column("row_v_m_s") }]);
-  add("Turning", "turn rate, degrees/s; left is positive", 90, [{ name: "ω", digits: 1, colour: () => colours.path, value: (i) => (run.row_w_rad_s[i] * 180) / Math.PI }]);
+  curve("doubt_s", "Time without recognition", "seconds; rises while walls disagree with the map; the animal is lost above a threshold", () => colours.match, { low: 0 });
+  curve("peak", "Peak activity of the pose cells", "share of the total activity", () => colours.path, { low: 0 });
+  curve("largest_correction", "Relaxation", "largest correction of a pose in a frame, m or rad", () => colours.second, { low: 0 });
+  add("Speed", "m/s", 90, [{ name: "v", colour: () => colours.map, value: column("row_v_m_s") }]);
+  add("Turn rate", "degrees/s; left is positive", 90, [{ name: "ω", digits: 1, colour: () => colours.path, value: (i) => (run.row_w_rad_s[i] * 180) / Math.PI }]);
   watch("row", () => charts.forEach((chart) => chart.mark()));
   watch("colours", () => charts.forEach((chart) => chart.paint()));
 }

@@ -1,8 +1,9 @@
-"""What a page tells of a run: facts as plain values, everything long as arrays."""
+"""Content of a report page: facts as plain values, tables as arrays."""
 
 import base64
 import inspect
 import math
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,18 +21,17 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
-from neuroslam.runs.reading import odometry_track, places_of, trajectory, true_poses
+from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
 from neuroslam.state.answers import counts_of, pictures_of
 from neuroslam.state.registry import population_classes
 
 _DRAWN = ("pose", "place", "semantic")  # kinds that the page draws by scripts of its own
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000
-"""Frames on a page, at most: of longer runs every k-th and those that changed the map."""
+"""Frames on a page, about: of longer runs every k-th, and those that changed the map."""
 
 _TEMPLATE_BYTES = 4_000_000
 
-# Sections of the config that do nothing, by what `cells` is.
 _USED_BY = {
     "view": "pose",
     "pose_cells": "pose",
@@ -41,15 +41,15 @@ _USED_BY = {
     "wall_memory": "place",
     "semantic": "semantic",
 }
-"""Sections of the config that only some brains use, and which cells those have."""
+"""Section of the config -> the cells that use it; other sections are always in use."""
 
 
 class Facts(NamedTuple):
-    """What a page tells of a run.
+    """The content of a page, without pictures of frames.
 
     Attributes:
         about: Plain values for JSON: names, counts, reports, config.
-        arrays: ``row_...`` a row a frame, ``place_...`` one an experience, ``link_...``,
+        arrays: ``row_...`` for each frame, ``place_...`` for each experience, ``link_...``,
             ``cell_...`` and ``wall_...`` likewise; lengths in m, angles in rad, times in s.
     """
 
@@ -58,7 +58,7 @@ class Facts(NamedTuple):
 
 
 def collect(run: FinishedRun) -> Facts:
-    """Collect what a page tells, but for the pictures."""
+    """Collect the content of a page from a run."""
     rows = chosen_rows(run.actions)
     arrays = _rows(run, rows) | _map(run) | _cells(run.brain)
     notes = []
@@ -68,7 +68,7 @@ def collect(run: FinishedRun) -> Facts:
             f"{_stride(len(run.actions))}th, and all that changed the map."
         )
     if not len(run.actions):
-        notes.append("Two brain files were merged: no frames belong to this map, only places.")
+        notes.append("This map was merged from two brain files: it has experiences, but no frames.")
     for name, curve in run.curves.items():
         key = name.rpartition("/")[2]
         arrays |= {
@@ -100,14 +100,14 @@ def collect(run: FinishedRun) -> Facts:
     lost_s = run.metrics.get("lost_s", 0.0)
     if lost_s and not about["lost"]:
         notes.append(
-            f"The robot was lost for {lost_s:.1f} s in all; when is kept in events/ only, "
+            f"The robot was lost for {lost_s:.1f} s in all; the times are only in events/, "
             "which this run does not have."
         )
     return Facts(about, arrays)
 
 
 def chosen_rows(actions: np.ndarray) -> np.ndarray:
-    """Choose the frames that a page holds: all of them, unless there are very many.
+    """Choose the rows of the frames on a page: all, or about :data:`MOST_ROWS` of a longer run.
 
     Example:
         >>> chosen_rows(np.array(["create", "none", "none"])).tolist()
@@ -116,7 +116,7 @@ def chosen_rows(actions: np.ndarray) -> np.ndarray:
     n = len(actions)
     if n <= MOST_ROWS:
         return np.arange(n)
-    some = [np.arange(0, n, _stride(n)), np.flatnonzero(actions != "none"), [n - 1]]
+    some = (np.arange(0, n, _stride(n)), np.flatnonzero(actions != "none"), np.array([n - 1]))
     return np.unique(np.concatenate(some))
 
 
@@ -125,9 +125,9 @@ def _stride(n: int) -> int:
 
 
 def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Everything that has a row a frame; places and poses are those of the final map."""
+    """Return the columns of all frames; experiences and poses are those of the final map."""
     frames, trace, brain = run.frames, run.trace, run.brain
-    place = places_of(brain, trace)[0]
+    place = experiences_of(brain, trace)[0]
     track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
     truth = truth_on_map(track, true_poses(trace))[0]
     whole = {
@@ -152,20 +152,20 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
 def truth_on_map(
     track: np.ndarray, truth: np.ndarray | None
 ) -> tuple[np.ndarray | None, float | None]:
-    """Lay the true track over the map, as ``map.png`` does.
+    """Align the true track to the map by a similarity transform, as ``map.png`` does.
 
     Returns:
-        Positions ``(frames, 2)`` in metres of the map, and metres of the truth in one of them;
-        ``None`` where there is no truth, or nothing tells how it lies.
+        Positions ``(frames, 2)`` in the coordinates of the map, and metres of the truth per metre
+        of the map; ``None`` without truth, or if the track fixes no alignment.
     """
     on_map = np.isfinite(track[:, 0])
     if truth is None or not on_map.any():
         return None, None
     try:
-        motion = align(track[on_map, :2], truth[on_map, :2], "similarity")
-    except MapError:  # the robot stood still, or went straight
+        alignment = align(track[on_map, :2], truth[on_map, :2], "similarity")
+    except MapError:  # the robot stood still
         return None, None
-    return motion.undo(truth[:, :2]), motion.scale
+    return alignment.undo(truth[:, :2]), alignment.scale
 
 
 def _map(run: FinishedRun) -> dict[str, np.ndarray]:
@@ -193,7 +193,7 @@ def _map(run: FinishedRun) -> dict[str, np.ndarray]:
 
 
 def template_pictures(brain: NavigationBrain) -> np.ndarray:
-    """Return the templates as grey pictures, ``uint8``, ``(n, h, w)``; smaller if they are many."""
+    """Return the templates as grey pictures, ``uint8``, ``(n, h, w)``; reduced if many."""
     view = brain.config.view
     height, width = view.template_height, view.template_width
     if not brain.view.n:
@@ -207,8 +207,8 @@ def template_pictures(brain: NavigationBrain) -> np.ndarray:
 
 
 def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
-    """The activity of the cells at the end of the run, and place cells with what they know."""
-    arrays = {}
+    """Return the activity of the cells at the end of the run, place cells, and landmarks."""
+    arrays: dict[str, np.ndarray] = {}
     for kind, population in brain.populations.items():
         if kind in _ARRAYS:
             arrays |= _ARRAYS[kind](population)
@@ -243,7 +243,7 @@ _ARRAYS: dict[str, Callable[[Any], dict[str, np.ndarray]]] = {
     "pose": _pose_cells,
     "place": _navigation_cells,
 }
-"""What the page draws of the package's own populations."""
+"""Kind of a population -> the arrays that the page draws of it."""
 
 
 def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
@@ -257,7 +257,7 @@ def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
         drawn = {} if kind in _DRAWN else pictures_of(population)
         card = {
             "kind": kind.replace("_", " "),
-            "what": (inspect.getdoc(type(population)) or "").partition("\n")[0],
+            "what": _plain((inspect.getdoc(type(population)) or "").partition("\n")[0]),
             "counts": metric_rows(counts_of(population)),
             "pictures": [
                 {"tag": tag, "layers": [_png(layer) for layer in layers]}
@@ -268,6 +268,16 @@ def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
         if card["counts"] or card["pictures"]:
             cards.append(card)
     return cards
+
+
+def _plain(text: str) -> str:
+    """Drop the roles and quotes of a docstring.
+
+    Example:
+        >>> _plain("See :func:`~a.b`, or ``c``.")
+        'See b, or c.'
+    """
+    return re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text).replace("`", "")
 
 
 def _png(picture: np.ndarray) -> dict[str, Any]:
@@ -284,13 +294,13 @@ def _png(picture: np.ndarray) -> dict[str, Any]:
 
 
 def lost_spans(run: FinishedRun) -> list[tuple[int, int]]:
-    """Find when the robot was lost, from the doubt that ``events/`` tells of.
+    """Find when the robot was lost, from ``cells/doubt_s`` in ``events/``.
 
-    It is lost from when its doubt exceeds ``wall_memory.lost_after_s`` until it is gone, as
-    :class:`~neuroslam.cells.familiarity.Familiarity` has it.
+    The robot is lost from when this time exceeds ``wall_memory.lost_after_s`` until it is 0, as
+    :class:`~neuroslam.cells.familiarity.Familiarity` defines it.
 
     Returns:
-        First and last row of ``frames.csv``, to the distance of two recorded points.
+        First and last row of ``frames.csv`` of each span, accurate to the recording interval.
     """
     doubt = run.curves.get("cells/doubt_s")
     if doubt is None:
@@ -299,13 +309,14 @@ def lost_spans(run: FinishedRun) -> list[tuple[int, int]]:
 
 
 def spans_above(curve: Curve, limit: float) -> list[tuple[int, int]]:
-    """Find the rows from where a curve exceeds a limit to where it is back at 0.
+    """Find the rows from where a curve exceeds a limit to where it returns to 0.
 
     Example:
         >>> spans_above(Curve(np.arange(6), np.array([0.0, 1, 3, 1, 0, 1])), 2.0)
         [(2, 4)]
     """
-    spans, began = [], None
+    spans: list[tuple[int, int]] = []
+    began: int | None = None
     for row, value in zip(curve.rows.tolist(), curve.values.tolist(), strict=True):
         if began is None and value > limit:
             began = row
@@ -316,7 +327,7 @@ def spans_above(curve: Curve, limit: float) -> list[tuple[int, int]]:
 
 
 def _within(rows: np.ndarray, span: tuple[int, int]) -> list[int]:
-    """Say where a span lies among the rows that the page holds."""
+    """Convert a span of rows of ``frames.csv`` to rows of the page."""
     return [int(i) for i in np.searchsorted(rows, span).clip(max=len(rows) - 1)]
 
 
@@ -361,10 +372,10 @@ def _sessions(run: FinishedRun) -> list[dict[str, Any]]:
 
 
 def _merge(report: dict[str, Any], run: FinishedRun) -> dict[str, Any]:
-    """Write a report for a reader, with the place where it happened as it is named now."""
+    """Return the lines of a merge report, and the experience of the merge on the final map."""
     place = None
     if report["at_frame"] is None and report["merged"] and report == run.brain.sessions.merges[-1]:
-        place = report["match"].get("loaded_experience")  # a later merge would have renamed it
+        place = report["match"].get("loaded_experience")  # ids before a later merge are not valid
     return {
         "lines": MergeReport(**report).lines(),
         "frame": report["at_frame"],
@@ -375,7 +386,7 @@ def _merge(report: dict[str, Any], run: FinishedRun) -> dict[str, Any]:
 
 
 def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
-    """List the figures of ``metrics.json``: name, value, unit; lists have places of their own.
+    """Return name, value and unit of the numbers in ``metrics.json``; lists are shown elsewhere.
 
     Example:
         >>> metric_rows({"frames": 3, "seconds": 1.5, "skipped": [], "ate_rmse_m": 0.2})
@@ -384,7 +395,7 @@ def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
     rows = []
     for key, value in metrics.items():
         if isinstance(value, list | dict) or (key in TIMINGS and not value):
-            continue  # a merge takes no time that was measured
+            continue  # a merge has no timings
         name, unit = key, ""
         if key.endswith(("_m", "_s")) and "_per_" not in key:
             name, _, unit = key.rpartition("_")
@@ -394,7 +405,7 @@ def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
 
 
 def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
-    """List every parameter by section: value, default, whether they differ, what it does."""
+    """Return every parameter by section: value, default, whether they differ, description."""
     plain = BrainConfig()
     general: dict[str, Any] = {"section": "brain", "used": True, "rows": []}
     sections = [general]
@@ -415,7 +426,7 @@ def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
 
 
 def _parameters(value: BaseModel, default: BaseModel, path: str) -> list[dict[str, Any]]:
-    """A section's own parameters, then those of the sections within it."""
+    """Return the parameters of a section and of its subsections, in their order."""
     rows = []
     for key, field in type(value).model_fields.items():
         mine, plain = getattr(value, key), getattr(default, key)
@@ -426,13 +437,13 @@ def _parameters(value: BaseModel, default: BaseModel, path: str) -> list[dict[st
     return rows
 
 
-def _parameter(key: str, value: object, default: object, what: str | None) -> dict[str, Any]:
+def _parameter(key: str, value: object, default: object, description: str | None) -> dict[str, Any]:
     return {
         "key": key,
         "value": _written(value),
         "default": _written(default),
         "differs": value != default,
-        "what": what or "",
+        "what": description or "",
     }
 
 

@@ -1,5 +1,5 @@
 "use strict";
-// What the page was given, and what follows from it: arrays, visits of places, loop closures.
+// The data of the page and quantities derived from it: visits of experiences, loop closures.
 
 const $ = (id) => document.getElementById(id);
 const about = JSON.parse($("about").textContent);
@@ -21,7 +21,7 @@ async function readArrays() {
   derive();
 }
 
-const known = {};  // what follows from the arrays
+const known = {};  // quantities derived from the arrays
 
 function derive() {
   known.rows = run.row_frame.length;
@@ -31,7 +31,7 @@ function derive() {
   known.firstRow = new Int32Array(places).fill(-1);
   known.visits = Array.from({ length: places }, () => []);  // pairs of first and last row
   known.seconds = new Float64Array(places);
-  const ways = new Map();  // first row that came to a place from another
+  const transitions = new Map();  // first row of each transition between two experiences
   for (let row = 0, before = -1; row < rows; row++) {
     const place = run.row_place[row];
     if (place >= 0) {
@@ -41,8 +41,8 @@ function derive() {
       else visits.push([row, row]);
       if (row + 1 < rows) known.seconds[place] += run.row_time_s[row + 1] - run.row_time_s[row];
       if (before >= 0 && before !== place) {
-        const way = before * places + place;
-        if (!ways.has(way)) ways.set(way, row);
+        const key = before * places + place;
+        if (!transitions.has(key)) transitions.set(key, row);
       }
     }
     before = place;
@@ -51,7 +51,7 @@ function derive() {
   known.linksOf = Array.from({ length: places }, () => []);
   for (let link = 0; link < links; link++) {
     const from = run.link_from[link], to = run.link_to[link];
-    const row = ways.get(from * places + to) ?? ways.get(to * places + from);
+    const row = transitions.get(from * places + to) ?? transitions.get(to * places + from);
     if (row !== undefined) known.linkRow[link] = row;
     known.linksOf[from].push(link);
     known.linksOf[to].push(link);
@@ -91,7 +91,7 @@ function pictureOfRow(row) {
 
 const pictureSource = (number) => "data:image/webp;base64," + pictures[number];
 
-// How long the robot had not been at a place when it came there in a row; null if it never was.
+// Seconds since the last visit of an experience before a row; null before its first visit.
 function awaySeconds(place, row) {
   let last = null;
   for (const [, end] of known.visits[place]) {

@@ -1,10 +1,10 @@
 "use strict";
-// The map: panned, zoomed, picked from. What does not change from frame to frame is kept as two
-// bitmaps larger than the window, so that moving the map costs the same however large it is.
+// The map: pan, zoom, selection. The parts that do not change with every frame are kept as two
+// bitmaps larger than the window, so that the cost of panning does not depend on the map's size.
 
 const SPARE = 0.3;  // of the window, on each side of it
 const SETTLED_MS = 140;
-const QUICK_MS = 7;  // what costs less is drawn anew at once
+const QUICK_MS = 7;  // sheets that take less are redrawn at once
 
 const layers = {
   links: { name: "Links", on: true },
@@ -16,9 +16,9 @@ const layers = {
   walls: { name: "Remembered walls", on: true },
   landmarks: { name: "Landmarks", on: true },
   merges: { name: "Merge points", on: true },
-  ids: { name: "Ids of places", on: true },
+  ids: { name: "Ids of experiences", on: true },
 };
-const colourings = { session: "session", visits: "visits", seconds: "time spent", since: "first seen" };
+const colourings = { session: "session", visits: "visits", seconds: "time spent", since: "first visit" };
 
 const map = {
   canvas: $("map"), width: 0, height: 0,
@@ -39,7 +39,7 @@ const map = {
     this.fit();
     listen();
   },
-  // How far apart linked places are, for the size of their dots.
+  // Median distance of linked experiences, for the size of their dots.
   spread() {
     const lengths = [];
     for (let i = 0; i < known.links; i += 1 + (known.links >> 11)) {
@@ -111,7 +111,7 @@ const map = {
     clearTimeout(this.settleTimer);
     this.settleTimer = setTimeout(() => this.paint(true), SETTLED_MS);
   },
-  // Bring a point into the window, where it is not.
+  // Bring a point into the window if it is outside.
   show(x, y) {
     const sx = this.sx(x), sy = this.sy(y), edge = 60;
     if (sx < edge || sy < edge || sx > this.width - edge || sy > this.height - edge) {
@@ -120,7 +120,7 @@ const map = {
     }
     this.draw();
   },
-  nearest(sx, sy, within) {  // 5 000 places take some microseconds: no index is needed
+  nearest(sx, sy, within) {  // 5 000 experiences take some microseconds: no index is needed
     const x = this.wx(sx), y = this.wy(sy);
     let best = -1, least = (within / this.view.scale) ** 2;
     for (let i = 0; i < known.places; i++) {
@@ -217,7 +217,7 @@ function paintStill(pen, at, dot) {
     drawLoops(pen, at, dot, (i) => known.linkRow[i] >= 0);
   }
   pen.globalAlpha = 1;
-  const before = [];  // places of earlier sessions where this run never came
+  const before = [];  // experiences of earlier sessions that this run did not visit
   for (let i = 0; i < known.places; i++) if (known.firstRow[i] < 0) before.push(i);
   drawPlaces(pen, at, dot, before);
   if (layers.loops.on) drawLoops(pen, at, dot, (i) => known.linkRow[i] < 0);
@@ -233,7 +233,7 @@ function paintProgressOn(pen, at, dot, from) {
     pen.lineWidth = dot < 2 ? 1.2 : 2;
     line(pen, at, run.row_x_m, run.row_y_m, Math.max(0, from), row);
   }
-  const seen = new Set();  // the path just drawn may lie over places of an earlier lap
+  const seen = new Set();  // redrawn: the path may cover experiences of an earlier lap
   for (let i = Math.max(0, from); i <= row && i < known.rows; i++) if (run.row_place[i] >= 0) seen.add(run.row_place[i]);
   drawPlaces(pen, at, dot, seen);
   const made = (link) => known.linkRow[link] >= 0 && known.linkRow[link] <= row;
@@ -253,7 +253,7 @@ function drawLinks(pen, at, colour, width, wanted) {
   pen.stroke();
 }
 
-// Loop closures are often as short as any link: a ring marks the place that was come back to.
+// Loop closures are often short: a ring marks the experience that was revisited.
 function drawLoops(pen, at, dot, wanted) {
   drawLinks(pen, at, colours.loop, 1.6, (i) => run.link_loop[i] && wanted(i));
   const radius = Math.max(dot + 2.2, 3.2);
@@ -268,7 +268,7 @@ function drawLoops(pen, at, dot, wanted) {
   pen.stroke();
 }
 
-// A bin for the colour of each place, so that places of one colour are drawn together.
+// Bins of colours, so that experiences of one colour are drawn together.
 function colourBins() {
   if (map.colouring === "session") return { of: (i) => run.place_session[i], colour: sessionColour };
   const values = {
@@ -318,7 +318,7 @@ function drawLandmarks(pen, at) {
 }
 
 function drawWalls(pen, at) {
-  const half = 0.05;  // metres: a stretch is remembered as a point with a bearing
+  const half = 0.05;  // metres: a part of a wall is stored as a point with a bearing
   pen.strokeStyle = colours.wall;
   pen.lineWidth = 3;
   pen.beginPath();

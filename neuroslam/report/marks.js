@@ -1,5 +1,5 @@
 "use strict";
-// Around and over the map: the grid, and what changes from frame to frame.
+// Around and over the map: the grid, and the marks that change with every frame.
 
 function drawGrid(pen, at) {
   const across = niceTicks(at.wx(0), at.wx(at.width), at.width / 110);
@@ -75,7 +75,7 @@ function drawLive(pen, at) {
     pen.lineWidth = 1.6;
     pen.stroke();
   }
-  if (layers.track.on) {  // on a second lap the path so far hides where the robot just came from
+  if (layers.track.on) {  // the recent path, drawn again over that of earlier laps
     pen.strokeStyle = colours.path;
     pen.lineWidth = 3.5;
     pen.lineJoin = pen.lineCap = "round";
@@ -123,7 +123,7 @@ function drawIds(pen, at, dot) {
   }
 }
 
-// Where maps were joined, by what the reports tell and names still mean.
+// Positions of merges on the final map, where the reports determine them.
 function mergePoints() {
   return about.merges.flatMap((report) => {
     const row = report.frame === null || !known.rows ? -1 : rowOfFrame(report.frame);

@@ -1,4 +1,4 @@
-"""Putting facts, pictures, style and scripts into one HTML file."""
+"""Assembly of facts, pictures, style and scripts into one HTML file."""
 
 import base64
 import html
@@ -21,30 +21,30 @@ SCRIPTS = (
     "data.js", "view.js", "map.js", "marks.js", "charts.js", "cells.js", "panels.js", "tables.js",
     "player.js",
 )  # fmt: skip
-"""Scripts of the page, in the order in which they need each other."""
+"""Scripts of the page, in order of dependence."""
 
 PICTURES_MB = 12.0
-"""All pictures of a page together, unless asked for otherwise."""
+"""Default size of all pictures of a page, in 1e6 bytes."""
 
 _TYPES = {"f": "<f4", "i": "<i4", "u": "<u1"}
-_EXACT = ("row_time_s",)  # seconds of a clock have more digits than four bytes hold
+_EXACT = ("row_time_s",)  # Unix times have more digits than four bytes hold
 
 
 def write_report(
     out: str | Path, to: str | Path | None = None, *, pictures_mb: float = PICTURES_MB
 ) -> Path:
-    """Write one HTML page that explains a run: its map, its frames, its cells and its figures.
+    """Write one HTML page about a run: its map, frames, cells and metrics.
 
-    The page needs nothing but itself: no network, no server, no other file.
+    The page is self-contained: it needs no network, no server and no other file.
 
     Args:
         out: Folder that ``run``, ``resume`` or ``merge`` wrote.
         to: File to write; ``report.html`` in that folder if not given.
-        pictures_mb: Room for pictures of frames, in 1e6 bytes of the page; 0: none, and sources
-            are not opened.
+        pictures_mb: Largest size of all pictures of frames, in 1e6 bytes of the page; 0: no
+            pictures, and sources are not opened.
 
     Returns:
-        The file that was written.
+        The file written.
 
     Raises:
         RunError: If the folder holds no run or a damaged one, or the page cannot be written.
@@ -53,11 +53,11 @@ def write_report(
     out = Path(out)
     to = out / "report.html" if to is None else Path(to)
     if not (math.isfinite(pictures_mb) and pictures_mb >= 0.0):
-        raise RunError(f"--pictures {pictures_mb:g}: expected megabytes, 0 for none")
+        raise RunError(f"--pictures {pictures_mb}: expected megabytes, 0 or more; 0 for none")
     if to.is_dir():
         raise RunError(f"{to}: is a folder; expected a file to write")
     if to.resolve() in {(out / name).resolve() for name in run_files(out)}:
-        raise RunError(f"{to}: is a file of the run, which would be lost; take another name")
+        raise RunError(f"{to}: is a file of the run and would be overwritten; give another name")
     run = read_run(out)
     page = make_page(collect(run), take_pictures(run, int(1e6 * pictures_mb)))
     try:
@@ -68,11 +68,11 @@ def write_report(
 
 
 def make_page(facts: Facts, pictures: Pictures) -> str:
-    """Make the HTML of a page.
+    """Return the HTML of a page.
 
     Args:
-        facts: What it tells.
-        pictures: Of frames.
+        facts: Content of the page.
+        pictures: Pictures of frames.
     """
     arrays = facts.arrays | {"place_picture": pictures.place, "picture_row": pictures.row}
     index, packed = pack(arrays)
@@ -89,19 +89,19 @@ def make_page(facts: Facts, pictures: Pictures) -> str:
     }
     page = (folder / "page.html").read_text(encoding="utf-8")
     head, *rest = page.split("{{")
-    for piece in rest:  # what is put in is not looked at again: a name may hold braces
+    for piece in rest:  # inserted text is not scanned again: a name may contain braces
         name, _, after = piece.partition("}}")
         head += parts[name] + after
     return head
 
 
 def pack(arrays: dict[str, np.ndarray]) -> tuple[dict[str, Any], str]:
-    """Write arrays as one text: compressed bytes in base64, and where in them each begins.
+    """Pack arrays into one text: compressed bytes in base64, and the offset of each array.
 
-    Numbers are little-endian and of four bytes, but for times and whole numbers below 256.
+    Numbers are little-endian with four bytes, except times (eight) and ``uint8`` (one).
 
     Returns:
-        For each array its type, shape and first byte; and the text.
+        Type, shape and offset in bytes of each array; and the text.
 
     Example:
         >>> index, text = pack({"x": np.arange(4, dtype=np.int32)})
@@ -112,7 +112,7 @@ def pack(arrays: dict[str, np.ndarray]) -> tuple[dict[str, Any], str]:
     for name, array in arrays.items():
         kind = "<f8" if name in _EXACT else _TYPES[array.dtype.kind]
         data = np.ascontiguousarray(array, dtype=kind).tobytes()
-        data += bytes(-len(data) % 8)  # each begins where numbers of eight bytes may
+        data += bytes(-len(data) % 8)  # arrays begin at multiples of eight bytes
         index[name] = [kind, list(array.shape), at]
         chunks.append(data)
         at += len(data)
@@ -120,7 +120,7 @@ def pack(arrays: dict[str, np.ndarray]) -> tuple[dict[str, Any], str]:
 
 
 def as_json(value: object) -> str:
-    r"""Write JSON that can stand in a page: nothing in it ends the element.
+    r"""Write JSON for a script element: without ``<``, it cannot end the element.
 
     Example:
         >>> as_json({"name": "</script>"})

@@ -1,5 +1,5 @@
 "use strict";
-// Beside the map: the frame at the slider, the place that was picked, the loop closures.
+// Beside the map: the current frame, the selected experience, the loop closures.
 
 const TABS = ["now", "place", "loops"];
 
@@ -28,7 +28,7 @@ function startTabs() {
   showTab("now");
 }
 
-const placeButton = (place, text = `place ${place}`) =>
+const placeButton = (place, text = `experience ${place}`) =>
   make("button", { class: "as-link", type: "button", text, onclick: () => choosePlace(place) });
 
 const rowButton = (row, text) =>
@@ -55,7 +55,7 @@ function picture(source, caption, alt) {
   return make("figure", {}, shown, make("figcaption", { text: caption }));
 }
 
-// The template of a place, drawn from its bytes.
+// The template of an experience, drawn from its bytes.
 function templateFigure(template, note = "") {
   const [n, height, width] = run.templates.shape;
   const figure = make("figure");
@@ -76,15 +76,15 @@ function templateFigure(template, note = "") {
   return figure;
 }
 
-const SAID = {
-  none: "at the same place", create: "a new place was made", link: "came to a known place",
-  set: "put where a map was joined, or a known place seen again",
+const ACTION_TEXT = {
+  none: "same experience", create: "new experience", link: "known experience",
+  set: "pose set: map joined, or relocalised",
 };
 
 function showNow() {
   const panel = $("now-facts"), row = chosen.row;
   if (!known.rows) {
-    panel.replaceChildren(make("p", { class: "soft", text: "This map was merged from brain files alone: it has no frames." }));
+    panel.replaceChildren(make("p", { class: "soft", text: "This map was merged from brain files: it has no frames." }));
     return;
   }
   const place = run.row_place[row], frame = run.row_frame[row], action = about.actions[run.row_action[row]];
@@ -97,28 +97,28 @@ function showNow() {
     : `${run.row_pose_x[row].toFixed(1)}, ${run.row_pose_y[row].toFixed(1)}, ${run.row_pose_theta[row].toFixed(1)} cells`;
   const at = run.row_x_m[row] === run.row_x_m[row]
     ? `${run.row_x_m[row].toFixed(2)} m, ${run.row_y_m[row].toFixed(2)} m, ${degrees(run.row_theta_rad[row])}`
-    : "on a map that was not joined";
+    : "on a map that is not joined";
   panel.replaceChildren(
-    make("span", { class: `act ${lost ? "lost" : action}`, text: lost ? "lost: walls contradict the map" : place < 0 ? "at no place of this map" : SAID[action] }),
+    make("span", { class: `act ${lost ? "lost" : action}`, text: lost ? "lost: walls disagree with the map" : place < 0 ? "no experience of this map" : ACTION_TEXT[action] }),
     hasViews || taken
       ? make("div", { class: "pair" },
-        picture(taken?.source, caption, `What the robot saw in ${caption}`),
-        hasViews ? templateFigure(place < 0 ? -1 : run.place_template[place], " of its place") : null)
+        picture(taken?.source, caption, `Picture of ${caption}`),
+        hasViews ? templateFigure(place < 0 ? -1 : run.place_template[place], " of its experience") : null)
       : "",
     facts([
       ["frame", `${frame}, ${duration(run.row_time_s[row] - run.row_time_s[0])} after the start`],
-      ["place", place >= 0 ? placeButton(place) : "none"],
+      ["experience", place >= 0 ? placeButton(place) : "none"],
       ["position", at],
       ["motion", `${run.row_v_m_s[row].toFixed(2)} m/s, ${degrees(run.row_w_rad_s[row])}/s`],
       ["match error", hasViews ? matchMeter(error) : null],
       ["pose cells", poses],
-      ["so far", `${many(run.row_n_experiences[row], "place")}, ${many(run.row_n_links[row], "link")}`],
+      ["so far", `${many(run.row_n_experiences[row], "experience")}, ${many(run.row_n_links[row], "link")}`],
     ]),
   );
 }
 
 function matchMeter(error) {
-  if (error < 0) return "nothing to compare with";
+  if (error < 0) return "no template to compare with";
   const top = 2 * about.threshold, share = (value) => `${Math.min(100, (100 * value) / top)}%`;
   const is_new = error > about.threshold;
   const bar = make("i", { class: is_new ? "over" : "", style: { width: share(error) } });
@@ -130,21 +130,21 @@ function showPlace() {
   const panel = $("place"), place = chosen.place;
   panel.classList.toggle("empty", place < 0);  // left out of a print
   if (!known.places) {
-    panel.replaceChildren(make("p", { class: "soft", text: "The map has no places." }));
+    panel.replaceChildren(make("p", { class: "soft", text: "The map has no experiences." }));
     return;
   }
   const step = (by) => choosePlace((Math.max(place, by > 0 ? -1 : 0) + by + known.places) % known.places);
-  const jump = make("input", { type: "number", min: 0, max: known.places - 1, "aria-label": "Go to place", placeholder: "id",
+  const jump = make("input", { type: "number", min: 0, max: known.places - 1, "aria-label": "Go to experience", placeholder: "id",
     onchange: (event) => {
       const id = Number(event.target.value);
       if (event.target.value !== "" && Number.isInteger(id) && id >= 0 && id < known.places) choosePlace(id);
     } });
   const head = make("div", { class: "picker" },
-    make("h3", { text: place < 0 ? "No place picked" : `Place ${place}` }), jump,
-    make("button", { type: "button", text: "‹", "aria-label": "Previous place", onclick: () => step(-1) }),
-    make("button", { type: "button", text: "›", "aria-label": "Next place", onclick: () => step(1) }));
+    make("h3", { text: place < 0 ? "No experience selected" : `Experience ${place}` }), jump,
+    make("button", { type: "button", text: "‹", "aria-label": "Previous experience", onclick: () => step(-1) }),
+    make("button", { type: "button", text: "›", "aria-label": "Next experience", onclick: () => step(1) }));
   if (place < 0) {
-    panel.replaceChildren(head, make("p", { class: "soft", text: "Click a place on the map, or type its id." }));
+    panel.replaceChildren(head, make("p", { class: "soft", text: "Click an experience on the map, or type its id." }));
     return;
   }
   const template = run.place_template[place], session = about.sessions[run.place_session[place]];
@@ -152,17 +152,17 @@ function showPlace() {
   panel.replaceChildren(head,
     template >= 0 || number >= 0
       ? make("div", { class: "pair" },
-        picture(number >= 0 ? pictureSource(number) : null, `frame ${first}, which made it`, `What the robot saw when place ${place} was made`),
+        picture(number >= 0 ? pictureSource(number) : null, `frame ${first}, its first`, `Picture of the first frame of experience ${place}`),
         template >= 0 ? templateFigure(template) : null)
       : "",
     facts([
       ["position", `${run.place_x_m[place].toFixed(2)} m, ${run.place_y_m[place].toFixed(2)} m, ${degrees(run.place_theta_rad[place])}`],
-      ["made", `at frame ${first}` + (session?.own ? "" : " of an earlier session")],
+      ["created", `at frame ${first}` + (session?.own ? "" : " of an earlier session")],
       ["session", session ? make("span", {}, make("i", { class: "swatch", style: { background: sessionColour(run.place_session[place]) } }), session.name) : null],
-      ["spent here", visits.length ? `${duration(known.seconds[place])} in ${many(visits.length, "visit")}` : "not visited in this run"],
+      ["time spent", visits.length ? `${duration(known.seconds[place])} in ${many(visits.length, "visit")}` : "not visited in this run"],
     ]),
     make("h3", { text: `Links (${known.linksOf[place].length})` }), linkChips(place),
-    make("h3", { text: `Visited by frames (${many(visits.length, "visit")})` }), visitChips(visits));
+    make("h3", { text: `Frames of the visits (${many(visits.length, "visit")})` }), visitChips(visits));
 }
 
 function linkChips(place) {
@@ -171,7 +171,7 @@ function linkChips(place) {
     const to = run.link_to[link], other = run.link_from[link] + to - place;
     chips.append(make("button", {
       type: "button", class: run.link_loop[link] ? "loop" : "",
-      title: `${metres(run.link_distance_m[link])} as measured, ${metres(run.link_off_m[link])} off on the map` + (run.link_loop[link] ? ", closes a loop" : ""),
+      title: `${metres(run.link_distance_m[link])} measured, residual ${metres(run.link_off_m[link])} on the map` + (run.link_loop[link] ? ", closes a loop" : ""),
       text: `${to === other ? "to" : "from"} ${other} · ${metres(run.link_distance_m[link])}`,
       onclick: () => choosePlace(other),
     }));
@@ -198,22 +198,22 @@ const LOOPS_SHOWN = 300;
 function showLoops(shown = LOOPS_SHOWN) {
   const panel = $("loops");
   if (!known.loops.length) {
-    panel.replaceChildren(make("p", { class: "soft", text: "No loop was closed." }));
+    panel.replaceChildren(make("p", { class: "soft", text: "No loop closures." }));
     return;
   }
   const rows = known.loops.slice(0, shown).map((link) => {
     const row = known.linkRow[link], to = run.link_to[link], away = row < 0 ? null : awaySeconds(to, row);
-    const go = make("button", { class: "as-link", type: "button", text: row < 0 ? "earlier" : `${run.row_frame[row]}`, "aria-label": `Loop closure from place ${run.link_from[link]} to place ${to}, go there` });
+    const go = make("button", { class: "as-link", type: "button", text: row < 0 ? "earlier" : `${run.row_frame[row]}`, "aria-label": `Go to the loop closure from experience ${run.link_from[link]} to ${to}` });
     return make("tr", { class: "go", "data-link": link, onclick: () => chooseLink(link) },
       make("td", {}, go), make("td", { text: `${run.link_from[link]} → ${to}` }),
       make("td", { class: "number", text: away === null ? "–" : duration(away) }),
       make("td", { class: "number", text: metres(run.link_off_m[link]) }));
   });
-  const head = make("tr", {}, make("th", { text: "frame", title: "that first went this way" }), make("th", { text: "places" }),
-    make("th", { class: "number", text: "away for", title: "since the robot was last at the place it came back to" }),
-    make("th", { class: "number", text: "off", title: "how far the link and the map disagree now" }));
+  const head = make("tr", {}, make("th", { text: "frame", title: "first frame that made or followed this link" }), make("th", { text: "experiences" }),
+    make("th", { class: "number", text: "time away", title: "since the last visit of the target" }),
+    make("th", { class: "number", text: "residual", title: "difference between the link and the final map" }));
   panel.replaceChildren(
-    make("p", { class: "lead", text: `${many(known.loops.length, "loop closure")}: links between places that were both known. A click goes there.` }),
+    make("p", { class: "lead", text: `${many(known.loops.length, "loop closure")}: links between experiences that both existed before. Click one to show it.` }),
     make("table", {}, make("thead", {}, head), make("tbody", {}, ...rows)),
     known.loops.length > shown ? make("button", { type: "button", text: `Show all ${known.loops.length}`, onclick: () => showLoops(Infinity) }) : "");
 }

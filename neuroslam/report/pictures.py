@@ -1,8 +1,8 @@
-"""Small pictures of frames, taken from the sources of a run where they can still be opened."""
+"""Small pictures of frames, from the sources of a run that can still be opened."""
 
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -15,19 +15,21 @@ from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame
 
 MOST = 4000
-"""Pictures on a page, at most."""
+"""Largest number of pictures on a page."""
 
-_SIDE_PX = (192, 128)  # a picture is shrunk to fit, a panorama to half as wide again
+_Item = TypeVar("_Item")
+
+_SIDE_PX = (192, 128)  # size limits of a picture; a panorama may be 1.5 times as wide
 _QUALITY = 60  # of WebP: 1 to 3 kB a picture
-_BLIND_AFTER = 20  # frames without an image: a source without a camera
+_BLIND_AFTER = 20  # frames without an image after which a source is taken to have no camera
 
 
-class Wanted(NamedTuple):
+class SourceFrame(NamedTuple):
     """A frame of a source.
 
     Attributes:
         source: Spec of the source.
-        frame: Its number there.
+        frame: Number of the frame in its source.
     """
 
     source: str
@@ -38,90 +40,89 @@ class Pictures(NamedTuple):
     """Pictures of a page, in the order of source and frame.
 
     Attributes:
-        files: Each as a WebP file.
-        at: What each shows.
-        place: Picture of each experience, as it was when it was made, or -1, ``(n_places,)``.
-        row: For the pictures of the run's own frames, their number in the source and the picture,
-            ``(n, 2)``, in the order of frames.
-        notes: What is missing, and why.
+        files: Contents of the WebP files.
+        at: Frame of each picture.
+        place: Picture of each experience's first frame, or -1, ``(n_experiences,)``.
+        row: Pictures of the run's own frames: frame number and picture, ``(n, 2)``, in order.
+        notes: Missing pictures, and why.
     """
 
     files: list[bytes]
-    at: list[Wanted]
+    at: list[SourceFrame]
     place: np.ndarray
     row: np.ndarray
     notes: list[str]
 
 
 def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
-    """Take pictures of the places, and of frames at even distances.
+    """Take pictures of the first frames of experiences, and of frames at regular intervals.
 
-    Where they are more than the budget allows, some at even distances are kept.
+    If they exceed the budget, a regular subset is kept.
 
     Args:
-        run: Whose frames.
-        budget_bytes: All pictures together, as base64 text; 0: none, no source is opened.
+        run: The run.
+        budget_bytes: Largest size of all pictures, as base64 text; 0: no source is opened.
     """
-    n_places, notes = run.brain.map.n, []
-    places, missing = _of_places(run)
-    taken: dict[Wanted, bytes] = {}
+    notes: list[str] = []
+    firsts, missing = _first_frames(run)
+    taken: dict[SourceFrame, bytes] = {}
     if budget_bytes:
         if missing:
             notes.append(
-                f"No pictures of {missing:,} places: the run of the session that made them is "
-                "not where it was."
+                f"No pictures of {missing:,} experiences: the folder of the run that made them "
+                "has been moved or deleted."
             )
         sources: dict[str, set[int]] = defaultdict(set)
-        for wanted in _thinned([*filter(None, places)], MOST // 2):
+        for wanted in _thinned([first for first in firsts if first is not None], MOST // 2):
             sources[wanted.source].add(wanted.frame)
         frames = run.frames["frame"].astype(np.int64).tolist()
         if frames:
             sources[run.plan.source].update(_thinned(frames, MOST // 2))
         for spec, numbers in sources.items():
             found, note = _from_source(spec, sorted(numbers), run.brain.config.frame_rate_hz)
-            taken |= {Wanted(spec, number): file for number, file in found.items()}
+            taken |= {SourceFrame(spec, number): file for number, file in found.items()}
             notes += [note] if note else []
         n_taken, taken = len(taken), _within(taken, budget_bytes)
         if len(taken) < n_taken:
             notes.append(
-                f"{len(taken):,} of {n_taken:,} pictures are on this page, at even distances, "
-                f"to keep it small."
+                f"{len(taken):,} of {n_taken:,} pictures are on this page, at regular intervals, "
+                "to limit its size."
             )
     else:
-        notes.append("Pictures of frames were left out when this page was made.")
+        notes.append("This page was made without pictures of frames.")
     at = sorted(taken)
-    number = {wanted: i for i, wanted in enumerate(at)}
-    place = np.array([number.get(wanted, -1) for wanted in places], np.int32)
+    number = {frame: i for i, frame in enumerate(at)}
+    place = np.array([-1 if first is None else number.get(first, -1) for first in firsts], np.int32)
     row = np.array(
-        [(wanted.frame, i) for i, wanted in enumerate(at) if wanted.source == run.plan.source],
+        [(frame.frame, i) for i, frame in enumerate(at) if frame.source == run.plan.source],
         np.int32,
     ).reshape(-1, 2)
-    assert len(place) == n_places
+    assert len(place) == run.brain.map.n
     return Pictures([taken[wanted] for wanted in at], at, place, row, notes)
 
 
-def _of_places(run: FinishedRun) -> tuple[list[Wanted | None], int]:
-    """The frame that made each place; ``None`` where its source is not known, and how many."""
+def _first_frames(run: FinishedRun) -> tuple[list[SourceFrame | None], int]:
+    """Return the first frame of each experience, ``None`` if its source is unknown; count those."""
     plans, table = session_plans(run), run.brain.map.experiences
     rows = zip(table["session"].tolist(), table["first_frame"].tolist(), strict=True)
-    places = [
-        Wanted(plans[session].source, frame) if session in plans else None
+    firsts = [
+        SourceFrame(plans[session].source, frame) if session in plans else None
         for session, frame in rows
     ]
-    return places, places.count(None)
+    return firsts, firsts.count(None)
 
 
 def _from_source(
     spec: str, numbers: list[int], frame_rate_hz: float
 ) -> tuple[dict[int, bytes], str]:
-    """Take the pictures of these frames; and say what is missing, or nothing."""
+    """Return pictures of these frames, and a note on those that are missing, or nothing."""
     name = RunPlan(spec).name
     found: dict[int, bytes] = {}
     seen, fault = 0, ""
     try:
         source = open_source(spec, frame_rate_hz)
         if source.live:
-            return found, f"No pictures of {name}: a live camera shows something else by now."
+            return found, f"No pictures of {name}: a live source cannot be read again."
         for frame in _frames(source, numbers):
             seen += 1
             if frame.image is not None:
@@ -129,30 +130,30 @@ def _from_source(
             elif not found and seen >= _BLIND_AFTER:
                 break
     except SourceError:
-        fault = "it cannot be read to its end" if seen else "it cannot be opened any more"
+        fault = "it cannot be read to its end" if seen else "it can no longer be opened"
     if seen and not found:
         fault = fault or "it has no camera"
     if not found:
-        return found, f"No pictures of {name}: {fault or 'its frames are not there any more'}."
+        return found, f"No pictures of {name}: {fault or 'its frames are missing'}."
     missing = len(numbers) - len(found)
     why = f": {fault}" if fault else ""
-    return found, f"{missing:,} frames of {name} have no picture any more{why}." if missing else ""
+    return found, f"Pictures of {missing:,} frames of {name} are missing{why}." if missing else ""
 
 
 def _frames(source: Source, numbers: list[int]) -> Iterator[Frame]:
-    """Yield these frames of a source, but for those that cannot be used."""
+    """Yield these frames of a source; unusable frames are left out."""
     if isinstance(source, IndexedSource):
         for number in numbers:
             yield from source.frames(number, number + 1, lambda _: None)
         return
-    wanted = set(numbers)
+    chosen = set(numbers)
     for frame in source.frames(numbers[0], numbers[-1] + 1, lambda _: None):
-        if frame.index in wanted:
+        if frame.index in chosen:
             yield frame
 
 
 def thumbnail(image: np.ndarray) -> bytes:
-    """Shrink a picture and write it as a WebP file.
+    """Reduce a picture and return it as a WebP file.
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
@@ -172,8 +173,8 @@ def thumbnail(image: np.ndarray) -> bytes:
     return cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()
 
 
-def _within(taken: dict[Wanted, bytes], budget_bytes: int) -> dict[Wanted, bytes]:
-    """Keep as many as fit, at even distances."""
+def _within(taken: dict[SourceFrame, bytes], budget_bytes: int) -> dict[SourceFrame, bytes]:
+    """Return a regular subset that fits into the budget."""
     keys = sorted(taken)
     while keys:
         size = sum(base64_size(len(taken[key])) for key in keys)
@@ -184,7 +185,7 @@ def _within(taken: dict[Wanted, bytes], budget_bytes: int) -> dict[Wanted, bytes
 
 
 def base64_size(n_bytes: int) -> int:
-    """Return how many letters of base64 so many bytes take.
+    """Return the size of so many bytes as base64 text.
 
     Example:
         >>> base64_size(4)
@@ -193,8 +194,8 @@ def base64_size(n_bytes: int) -> int:
     return 4 * -(-n_bytes // 3)
 
 
-def _thinned(items: list, most: int) -> list:
-    """Keep some at even distances, the first and the last among them."""
+def _thinned(items: list[_Item], most: int) -> list[_Item]:
+    """Return a regular subset with the first and the last item."""
     if len(items) <= most:
         return items
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]

@@ -1,8 +1,8 @@
 "use strict";
-// The slider, playing, the keys; and the start of it all.
+// The slider, playback, keys; and the start of the page.
 
 const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500];
-const PLAYED_S = 40;  // a whole run at the speed it begins with
+const PLAYED_S = 40;  // duration of a whole run at the initial speed
 
 const player = {
   last: 0, time: 0,
@@ -24,7 +24,7 @@ const player = {
     if (!chosen.playing) return;
     const passed = Math.min(0.25, (now - this.last) / 1000) * Number($("speed").value);
     this.last = now;
-    if (rowOfTime(this.time) !== chosen.row) this.time = run.row_time_s[chosen.row];  // someone moved the slider
+    if (rowOfTime(this.time) !== chosen.row) this.time = run.row_time_s[chosen.row];  // the slider was moved
     this.time += passed;
     chooseRow(rowOfTime(this.time));
     if (chosen.row >= known.rows - 1) this.pause();
@@ -42,10 +42,10 @@ function showClock() {
   $("clock").replaceChildren(
     make("b", { text: `frame ${run.row_frame[row]}` }), make("br"),
     `${duration(run.row_time_s[row] - first)} of ${duration(last - first)}`);
-  $("slider").setAttribute("aria-valuetext", `frame ${run.row_frame[row]}, ${duration(run.row_time_s[row] - first)}, place ${run.row_place[row]}`);
+  $("slider").setAttribute("aria-valuetext", `frame ${run.row_frame[row]}, ${duration(run.row_time_s[row] - first)}, experience ${run.row_place[row]}`);
 }
 
-// Where along the slider places were made, known ones came back to, and the robot was lost.
+// Strip above the slider: new experiences, revisits, merges, and times when the robot was lost.
 function paintStrip() {
   const canvas = $("strip"), width = canvas.clientWidth, height = 18;
   if (!width || !known.rows) return;
@@ -172,7 +172,7 @@ function hover(x, y) {
   map.canvas.classList.toggle("over", place >= 0);
   tip.hidden = place < 0;
   if (place < 0) return;
-  tip.textContent = `place ${place} · ${many(known.visits[place].length, "visit")}`;
+  tip.textContent = `experience ${place} · ${many(known.visits[place].length, "visit")}`;
   tip.style.left = `${Math.min(x + 14, map.width - tip.offsetWidth - 8)}px`;
   tip.style.top = `${Math.max(4, y - 30)}px`;
 }

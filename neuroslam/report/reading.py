@@ -1,4 +1,4 @@
-"""What a finished run left in its folder, read and checked once."""
+"""Reading and checking the folder of a finished run."""
 
 import warnings
 from pathlib import Path
@@ -19,18 +19,18 @@ from neuroslam.runs.reading import (
 )
 
 CURVES = ("cells/peak", "cells/doubt_s", "map/largest_correction")
-"""What a page shows of ``events/``: scalars that no other file of a run has."""
+"""Scalars of ``events/`` that no other file of a run has."""
 
 
 class Curve(NamedTuple):
-    """A scalar over a run: rows of ``frames.csv`` and the values there, arrays of one length."""
+    """A scalar over a run: rows of ``frames.csv`` and the values, arrays of equal length."""
 
     rows: np.ndarray
     values: np.ndarray
 
 
 class FinishedRun(NamedTuple):
-    """The files of a run; ``frames`` and ``trace`` have a row a frame, or none after a merge."""
+    """The files of a run; ``frames`` and ``trace`` have a row per frame, or none after a merge."""
 
     out: Path
     plan: RunPlan
@@ -45,7 +45,7 @@ class FinishedRun(NamedTuple):
 def read_run(out: str | Path) -> FinishedRun:
     """Read the folder that ``run``, ``resume`` or ``merge`` wrote.
 
-    Rows that a killed run wrote after its last save are left out.
+    Rows that a killed run wrote after its last checkpoint are ignored.
 
     Raises:
         RunError: If the folder holds no run, or a file of it is missing or damaged.
@@ -58,7 +58,7 @@ def read_run(out: str | Path) -> FinishedRun:
     plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
     rows = brain.clock.frames_seen
     if brain.sessions.merges and not frame_rows(out, 1):
-        rows = 0  # two brain files were merged: nobody knows their frames
+        rows = 0  # a merge of two brain files, without frames
     frames, actions = read_frames(out, rows), read_actions(out, rows)
     trace = read_trace(out, rows or None, min_rows=0)
     return FinishedRun(
@@ -74,7 +74,7 @@ def read_run(out: str | Path) -> FinishedRun:
 
 
 def read_curves(out: Path, frames: np.ndarray) -> dict[str, Curve]:
-    """Read ``CURVES`` from the TensorBoard events of a run; those that there are.
+    """Read those of ``CURVES`` that the TensorBoard events of a run have.
 
     Args:
         out: Folder of the run.
@@ -84,13 +84,13 @@ def read_curves(out: Path, frames: np.ndarray) -> dict[str, Curve]:
     if not files or not len(frames):
         return {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tensorboard's, of what it imports
+        warnings.simplefilter("ignore")  # deprecations in tensorboard's imports
         from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
     found: dict[str, dict[int, float]] = {name: {} for name in CURVES}
     for file in files:
         for event in EventFileLoader(str(file)).Load():
             for value in event.summary.value:
-                if value.tag in found:  # of a frame that was seen twice the later counts
+                if value.tag in found:  # a resumed run may repeat a frame: the later value counts
                     found[value.tag][int(event.step)] = float(value.tensor.float_val[0])
     curves = {}
     for name, points in found.items():
@@ -105,30 +105,30 @@ def read_curves(out: Path, frames: np.ndarray) -> dict[str, Curve]:
 
 
 def session_plans(run: FinishedRun) -> dict[int, RunPlan]:
-    """Find what each session of a map was driven through, as far as the runs are still there.
+    """Find the plan of the run of each session of a map, as far as their folders exist.
 
-    A run's folder names its own source, and the stored maps that it went on in; the folders of
-    those name theirs.
+    The folder of a run names its source and the stored maps that it joined; their folders in turn
+    name their sources.
 
     Returns:
-        Session id to the plan of the run it was made in.
+        Session id -> plan of the run that made it.
     """
     plans: dict[int, RunPlan] = {}
-    asked: set[Path] = set()
-    left: list[tuple[RunPlan, NavigationBrain]] = [(run.plan, run.brain)]
-    while left:
-        plan, brain = left.pop()
+    visited: set[Path] = set()
+    pending: list[tuple[RunPlan, NavigationBrain]] = [(run.plan, run.brain)]
+    while pending:
+        plan, brain = pending.pop()
         merged = plan.source.endswith(brain_file(run.out).suffix)  # two brain files, see merge
         drive = brain.sessions.this_drive() if brain.sessions.sessions else set()
         for session in brain.sessions.sessions:
             if session.name in drive and not merged:
                 plans.setdefault(session.id, plan)
         for path in map(Path, (plan.source, *plan.maps) if merged else plan.maps):
-            if path in asked:
+            if path in visited:
                 continue
-            asked.add(path)
+            visited.add(path)
             try:
-                left.append((read_plan(path.parent), load_brain(path)))
-            except NeuroslamError:  # moved, or a brain file alone: its source is not known
+                pending.append((read_plan(path.parent), load_brain(path)))
+            except NeuroslamError:  # moved, or a brain file without its run: source unknown
                 continue
     return plans

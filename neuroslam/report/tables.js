@@ -1,13 +1,13 @@
 "use strict";
-// The parts of the page that are text: headline, sessions and merges, figures, config, notes.
+// The text of the page: headline, sessions and merges, metrics, config, notes.
 
 function startHeadline() {
   const s = about.summary, parts = [];
   if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} m driven`);
-  parts.push(many(s.places, "place"), many(s.loop_closures, "loop closure"));
+  parts.push(many(s.places, "experience"), many(s.loop_closures, "loop closure"));
   if (about.sessions.length > 1) parts.push(many(about.sessions.length, "session"));
   if (about.merges.length) parts.push(many(about.merges.length, "merge"));
-  if (s.ate_m !== null) parts.push(`error ${metres(s.ate_m)} (odometry alone ${metres(s.odometry_ate_m)})`);
+  if (s.ate_m !== null) parts.push(`ATE ${metres(s.ate_m)} (odometry alone ${metres(s.odometry_ate_m)})`);
   if (s.interrupted) parts.push("interrupted");
   $("headline").textContent = parts.join(" · ");
   $("headline").title = $("headline").textContent;
@@ -18,14 +18,17 @@ function tableOf(names, rows) {
     make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
 }
 
-const CARRIED = "the robot was carried";
-// Files written before the word was kidnapped say carried.
-const BEGAN = { start: "the run", kidnapped: CARRIED, carried: CARRIED, gap: "a gap in the frames" };
+const BEGAN = {
+  start: "the run",
+  kidnapped: "the robot was kidnapped",
+  carried: "the robot was kidnapped", // brains of format 3
+  gap: "a gap in the frames",
+};
 
 function startSessions() {
   const list = $("session-list"), places = new Array(about.sessions.length).fill(0);
   for (const session of run.place_session) places[session]++;
-  list.append(make("div", { class: "card text" }, tableOf(["session", "source", "began with", "frames", "places", ""],
+  list.append(make("div", { class: "card text" }, tableOf(["session", "source", "began with", "frames", "experiences", ""],
     about.sessions.map((session, i) => make("tr", {},
       make("td", {}, make("i", { class: "swatch", style: { background: sessionColour(i) } }), session.name),
       make("td", { text: [session.source || "unknown", session.preset && `preset ${session.preset}`, session.recorded].filter(Boolean).join(", ") }),
@@ -43,14 +46,14 @@ function startSessions() {
     list.append(make("div", { class: "card text" }, make("h3", { text: `Not joined: the map of ${stored.sessions.join(", ")}` }), make("p", { class: "soft", text: stored.reason })));
   }
   if (!about.merges.length && !about.refused.length && !about.not_joined.length) {
-    list.append(make("p", { class: "lead", text: "One map, no merges." }));
+    list.append(make("p", { class: "lead", text: "One map without merges." }));
   }
   watch("colours", () => list.querySelectorAll("tbody .swatch").forEach((swatch, i) => { swatch.style.background = sessionColour(i); }));
 }
 
-function reportCard(what, report, point) {
+function reportCard(outcome, report, point) {
   const [first, ...others] = report.lines;
-  const heading = `${what}${report.frame === null ? "" : ` at frame ${report.frame}`}: ${first.replace(/^(not )?merged: /, "")}`;
+  const heading = `${outcome}${report.frame === null ? "" : ` at frame ${report.frame}`}: ${first.replace(/^(not )?merged: /, "")}`;
   const card = make("div", { class: "card text" }, make("h3", { text: heading }),
     make("p", { class: "soft", text: `session ${report.partial.at(-1)} into ${report.loaded.join(", ")}` }),
     make("ul", {}, ...others.map((text) => make("li", { text }))));
@@ -75,8 +78,8 @@ function startPopulations() {
     for (const { tag, layers } of one.pictures) {
       const drawn = layers.map(({ png, width, height }) => {
         const scale = Math.max(1, Math.min(12, Math.floor(280 / Math.max(width, height))));
-        return make("img", { class: "activity", src: `data:image/png;base64,${png}`, width: width * scale, height: height * Math.max(scale, Math.ceil(24 / height)),
-          alt: `${tag}: activity of ${one.kind}` });
+        return make("img", { class: "activity", src: `data:image/png;base64,${png}`,
+          style: { width: `${width * scale}px`, height: `${height * Math.max(scale, Math.ceil(24 / height))}px` }, alt: `${tag}: activity of ${one.kind}` });
       });
       card.append(make("figure", {}, make("div", { class: "layers-of" }, ...drawn), make("figcaption", { text: tag })));
     }
@@ -105,8 +108,8 @@ function startConfig() {
   box.addEventListener("change", () => columns.classList.toggle("only-differing", box.checked));
   const { start, stop, on_bad_frame } = about.range;
   $("config-list").append(
-    make("p", { class: "lead", text: `${differing.length} of ${all.length} parameters differ from their defaults; they are marked. Frames ${start} to ${stop === null ? "the end" : stop - 1} of the source, a bad frame: ${on_bad_frame}.` }),
-    make("label", {}, box, " only what differs"), columns);
+    make("p", { class: "lead", text: `${differing.length} of ${all.length} parameters differ from their defaults and are marked. Frames ${start} to ${stop === null ? "the end" : stop - 1} of the source; bad frames: ${on_bad_frame}.` }),
+    make("label", {}, box, " only parameters that differ"), columns);
   for (const part of about.config) {
     const has = part.rows.some((row) => row.differs);
     columns.append(make("div", { class: `config-part${part.used ? "" : " unused"}${has ? " has-differing" : ""}` },
@@ -119,14 +122,14 @@ function startConfig() {
 
 function startNotes() {
   const keys = [["space", "play, pause"], ["← →", "one frame; with shift ten"], ["home end", "first and last frame"],
-    ["on the map: arrows", "move"], ["+ −", "zoom"], ["0", "show all"], ["N P", "next and previous place"], ["enter", "the place nearest the middle"]];
+    ["on the map: arrows", "move"], ["+ −", "zoom"], ["0", "show all"], ["N P", "next and previous experience"], ["enter", "the experience nearest the middle"]];
   const notes = [
-    "Places, links and the path are those of the final map: a frame keeps its offset from its place, so the path moves with the map.",
-    "The path grows with the slider; places fill in when the robot first comes to them. A loop closure is a link between places that were both known.",
-    ...(run.row_truth_x_m ? [`The truth is turned, shifted and scaled to lie over the path: one metre of the map is ${figure(about.truth_scale)} m. The errors among the figures are without scaling.`] : []),
+    "Experiences, links and the path are those of the final map: a frame keeps its offset from its experience, so the path moves with the map.",
+    "The path follows the slider; experiences become opaque at their first visit. A loop closure is a link between experiences that both existed before it.",
+    ...(run.row_truth_x_m ? [`The truth is aligned to the path by a similarity transform: one metre of the map is ${figure(about.truth_scale)} m. The errors among the metrics are without scaling.`] : []),
     ...about.notes, ...about.picture_notes,
-    pictures.length ? `${many(pictures.length, "picture")} of frames are in this page; the frame shown is the nearest one before the slider that has a picture.` : "No pictures of frames are in this page.",
-    "The page is one file and asks nothing of the network.",
+    pictures.length ? `The page has ${many(pictures.length, "picture")} of frames; it shows the nearest one at or before the slider.` : "The page has no pictures of frames.",
+    "The page is a single file and makes no network requests.",
   ];
   $("note-list").append(make("ul", {}, ...notes.map((text) => make("li", { text }))),
     make("p", {}, ...keys.flatMap(([key, what]) => [make("kbd", { text: key }), ` ${what}   `])));
@@ -151,16 +154,16 @@ function showLegend() {
   const items = [], add = (kind, style, text) => items.push(make("span", {}, make("i", { class: kind, style }), text));
   const colour = (value) => ({ borderColor: value });
   if (map.colouring === "session") {
-    if (about.sessions.length < 2) add("key-dot", { background: sessionColour(0) }, !about.cells.includes("pose") ? "places (place cells)" : "places");
+    if (about.sessions.length < 2) add("key-dot", { background: sessionColour(0) }, !about.cells.includes("pose") ? "experiences (place cells)" : "experiences");
     else about.sessions.slice(0, 6).forEach((session, i) => add("key-dot", { background: sessionColour(i) }, `session ${i + 1}${session.own ? ", this run" : ""}`));
-  } else add("key-ramp", { background: rampStyle }, `few to many: ${colourings[map.colouring]}`);
+  } else add("key-ramp", { background: rampStyle }, `low to high: ${colourings[map.colouring]}`);
   if (layers.links.on) add("key-line", colour(colours.link), "links");
   if (layers.loops.on) add("key-line", colour(colours.loop), "loop closures");
   if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
   if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
   if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, scaled by ${(1 / about.truth_scale).toFixed(2)}`);
-  if (layers.merges.on) add("key-ring", colour(colours.match), "maps joined here");
-  if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "walls as remembered");
+  if (layers.merges.on) add("key-ring", colour(colours.match), "merge points");
+  if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "remembered walls");
   if (layers.landmarks.on) add("key-dot", { background: colours.landmark }, "landmarks");
   $("legend").replaceChildren(...items);
 }

@@ -1,16 +1,16 @@
 "use strict";
-// What is chosen, who wants to know of it, and the colours.
+// The selection, its watchers, and the colours.
 
 const chosen = { row: 0, place: -1, link: -1, playing: false };
 const watchers = { row: [], place: [], link: [], colours: [] };
 const watch = (what, then) => watchers[what].push(then);
-const tell = (what) => watchers[what].forEach((then) => then());
+const notify = (what) => watchers[what].forEach((then) => then());
 
 function chooseRow(row) {
   row = Math.max(0, Math.min(known.rows - 1, Math.round(row)));
   if (row === chosen.row || !known.rows) return;
   chosen.row = row;
-  tell("row");
+  notify("row");
 }
 
 function choosePlace(place, show = true) {
@@ -18,10 +18,10 @@ function choosePlace(place, show = true) {
   if (place >= 0) {
     chosen.link = -1;
     if (show) map.show(run.place_x_m[place], run.place_y_m[place]);
-    $("said").textContent = `Place ${place}, ${many(known.visits[place].length, "visit")}`;
+    $("said").textContent = `Experience ${place}, ${many(known.visits[place].length, "visit")}`;
     showTab("place");
   }
-  tell("place");
+  notify("place");
 }
 
 function chooseLink(link) {
@@ -30,9 +30,9 @@ function chooseLink(link) {
   const from = run.link_from[link], to = run.link_to[link];
   if (known.linkRow[link] >= 0) chooseRow(known.linkRow[link]);
   map.show((run.place_x_m[from] + run.place_x_m[to]) / 2, (run.place_y_m[from] + run.place_y_m[to]) / 2);
-  $("said").textContent = `Loop closure from place ${from} to place ${to}`;
-  tell("place");
-  tell("link");
+  $("said").textContent = `Loop closure from experience ${from} to ${to}`;
+  notify("place");
+  notify("link");
 }
 
 const colours = {};
@@ -44,7 +44,7 @@ function readColours() {
     "odometry", "truth", "link", "wall", "landmark", "match", "lost", ...SESSIONS]) {
     colours[name] = style.getPropertyValue(`--${name}`).trim();
   }
-  tell("colours");
+  notify("colours");
 }
 
 const sessionColour = (session) => colours[SESSIONS[session % SESSIONS.length]];
@@ -66,7 +66,7 @@ addEventListener("beforeprint", () => {
 });
 addEventListener("afterprint", () => setTheme(beforePrint));
 
-// Viridis at nine points: what the figures of the package use.
+// Viridis at nine points, as in the package's figures.
 const RAMP = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141],
   [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
 
@@ -78,7 +78,7 @@ function ramp(share) {
 const rampColour = (share) => `rgb(${ramp(share).join(",")})`;
 const rampStyle = `linear-gradient(to right, ${RAMP.map((rgb) => `rgb(${rgb})`).join(",")})`;
 
-// A canvas as large as its place on the page, in the screen's own pixels.
+// Fit a canvas to its box on the page, in device pixels.
 function fitCanvas(canvas, width, height) {
   const dpr = Math.min(2, devicePixelRatio || 1);
   const w = Math.max(1, Math.round(width * dpr)), h = Math.max(1, Math.round(height * dpr));

@@ -28,13 +28,13 @@ from neuroslam.runs.reading import (
 from neuroslam.state.answers import pictures_of
 from neuroslam.types import PoseEstimate
 
-_TITLE_WIDTH = 90  # letters
+_TITLE_WIDTH = 90  # characters
 
 
 def plot(out: str | Path, to: str | Path) -> list[Path]:
-    """Draw the figures of a run: map, cells at its end, recognition and counts over time.
+    """Draw the figures of a run: map, cells at its end, view matches and counts over time.
 
-    Of cells, views and walls those that the brain has are drawn.
+    Only cells, views and walls that the brain has are drawn.
 
     Returns:
         The files that were written.
@@ -77,15 +77,15 @@ def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Fig
 _DRAWN: dict[str, Callable[[Any, np.ndarray], dict[str, Figure]]] = {
     "pose": _draw_pose_cells,
     "place": _draw_place_cells,
-    "semantic": lambda _cells, _path: {},  # its landmarks are on the map
+    "semantic": lambda _cells, _path: {},  # landmarks are drawn on the map
 }
-"""Figures of the package's own populations; all others have their images drawn."""
+"""Figures of populations of the package; of all others the images are drawn."""
 
 
 def draw_map(
     brain: NavigationBrain, plan: RunPlan, trace: dict[str, np.ndarray], path: Path
 ) -> None:
-    """Draw ``map.png`` of a run: in the coordinates of its CSVs, each session in its colour."""
+    """Draw ``map.png`` of a run in the coordinates of its CSVs, one colour per session."""
     links, truth, log = brain.map.links, true_poses(trace), brain.sessions
     track = trajectory(brain, trace)[:, :2]
     on_map = np.isfinite(track[:, 0])
@@ -111,7 +111,7 @@ def draw_map(
 
 
 def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
-    """Say what is on the map, and what is on others."""
+    """Return the title: source, frames, sessions, and frames on maps that were not joined."""
     n, sources = len(on_map), dict.fromkeys(s.source for s in brain.sessions.sessions)
     title = f"{plan.name}: {counted(n, 'frame')}"
     if len(brain.sessions.sessions) > 1:
@@ -128,7 +128,7 @@ def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
 
 
 def _session_names(brain: NavigationBrain) -> list[str]:
-    """Name sessions by their sources, and where one has several by their first frames too."""
+    """Name sessions by source, and by first frame too if a source has several."""
     sessions = brain.sessions.sessions
     times = Counter(session.source for session in sessions)
     names = []

@@ -13,6 +13,9 @@ from neuroslam.types import Frame, Velocity
 _KINDS = {"U": "text", "S": "text", "O": "objects", "b": "booleans", "c": "complex numbers"}
 _LARGEST_INDEX = 2**63
 
+_FASTEST = 1e6
+"""In m/s or rad/s: no robot is faster, and far beyond it cells can no longer be counted."""
+
 
 def checked_array(
     value: Any,  # noqa: ANN401
@@ -87,7 +90,7 @@ def checked_number(value: object, what: str, unit: str) -> float:
 
 
 def checked_odometry(velocity: Any) -> Velocity:  # noqa: ANN401
-    """Convert measured self-motion to a :class:`Velocity` of two finite numbers.
+    """Convert measured self-motion to a :class:`Velocity` of two finite numbers up to 1e6.
 
     Raises:
         BadFrame: If it is anything else.
@@ -110,6 +113,11 @@ def checked_odometry(velocity: Any) -> Velocity:  # noqa: ANN401
     v, w = _as_float(v), _as_float(w)
     if not (math.isfinite(v) and math.isfinite(w)):
         raise BadFrame(f"odometry v = {v} m/s, w = {w} rad/s; expected finite numbers")
+    if max(abs(v), abs(w)) > _FASTEST:
+        raise BadFrame(
+            f"odometry v = {v} m/s, w = {w} rad/s; expected at most {_FASTEST:g}: check the "
+            "units of the source"
+        )
     return Velocity(v, w)
 
 

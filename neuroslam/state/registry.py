@@ -54,8 +54,8 @@ def register(kind: str) -> Callable[[Kind], Kind]:
             raise ConfigError(f"{what}: {cls!r} is no subclass of Population")
         _check_kind(kind, cls)
         before = registered.get(kind)
-        named = cls.kind, cls.name
-        cls.kind, cls.name = kind, cls.__dict__.get("name", kind)
+        named = {key: cls.__dict__[key] for key in ("kind", "name") if key in cls.__dict__}
+        cls.kind, cls.name = kind, named.get("name", kind)
         registered[kind] = cls
         try:
             if kind not in HOMES:  # the tests look at the package's own: imports stay quick
@@ -65,7 +65,10 @@ def register(kind: str) -> Callable[[Kind], Kind]:
                 _check_empty(cls)
         except ConfigError:
             del registered[kind]
-            cls.kind, cls.name = named
+            for key in {"kind", "name"} - named.keys():
+                delattr(cls, key)
+            for key, value in named.items():
+                setattr(cls, key, value)
             if before is not None:
                 registered[kind] = before
             raise
@@ -85,6 +88,9 @@ def _check_kind(kind: str, cls: type[Population]) -> None:
         raise ConfigError(f"{what}: expected a name like head_direction, without _and_")
     if kind in BrainConfig.model_fields or hasattr(BrainConfig, kind):
         raise ConfigError(f"{what}: is a name of the config already; choose another name")
+    twice = next((k for k, other in registered.items() if other is cls and k != kind), None)
+    if twice is not None:
+        raise ConfigError(f"{what}: is registered as {twice!r} already; register a subclass")
     before = registered.get(kind)
     if before is not None and _source(before) != _source(cls):
         raise ConfigError(
@@ -136,12 +142,12 @@ def _check_empty(cls: type[Population]) -> None:
     what = f"@register({cls.kind!r})"
     try:
         one, other = (cls.build(BrainConfig(cells=(cls.kind,)), cls) for _ in range(2))
+        loaded, partial = one.state_dict(), other.state_dict()
     except Exception as error:
         raise ConfigError(
             f"{what}: cannot be built from the default config ({_said(error)}); every parameter "
             "needs a default"
         ) from error
-    loaded, partial = one.state_dict(), other.state_dict()
     strange = sorted(set(cls.growing) - set(dict(one.named_buffers(recurse=False))))
     if strange:
         raise ConfigError(f"{what}: growing names {', '.join(strange)}, which is no buffer of it")

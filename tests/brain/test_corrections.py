@@ -18,9 +18,14 @@ from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.head_direction import HeadDirectionCells, Heard
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
-from neuroslam.config import BrainConfig, build_config
+from neuroslam.config import (
+    BoundaryCellConfig,
+    BrainConfig,
+    MapConfig,
+    PoseCellConfig,
+    build_config,
+)
 from neuroslam.config.populations import registered
-from neuroslam.config.sections import BoundaryCellConfig, MapConfig, PoseCellConfig
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.geometry import wrap_angle
 from neuroslam.mapping.experience import ExperienceMap

@@ -87,7 +87,7 @@ def test_landmarks_bring_a_lap_home(cells, drive):
     track = np.array([brain(frame).pose[:2] for frame in drive])
     assert absolute_trajectory_error(track, truth, "rigid").rmse < 0.35
     assert brain.semantic.n == 12
-    places = open_source(DRIVE).places_m
+    places = open_source(DRIVE).posts_m
     known = brain.semantic.landmarks()
     laid = align(track, truth, "rigid").apply(known["place_m"])
     off = np.linalg.norm(laid - places[known["number"]], axis=1)
@@ -130,7 +130,7 @@ def test_a_landmark_that_was_first_seen_where_it_is_not_is_found_where_it_is(fol
     np.testing.assert_allclose(cells.landmarks()["place_m"], [[2.0, 0.0]], atol=0.05)
 
 
-def test_landmarks_without_names_are_told_apart_by_their_places():
+def test_landmarks_without_names_are_distinguished_by_position():
     cells = SemanticCells(SemanticConfig())
     ring = [(-1, 3.0, 2.0 * math.pi * k / 5) for k in range(5)]
     for _ in range(60):
@@ -143,7 +143,7 @@ def test_landmarks_without_names_are_told_apart_by_their_places():
     assert set(known["name"]) == {f"nameless_{k}" for k in range(5)}
 
 
-def test_a_landmark_that_two_sensors_tell_counts_once():
+def test_a_landmark_that_two_sensors_report_counts_once():
     scanner, camera = (
         np.array([[7, 2.0, 0.1], [-1, 1.0, 0.0]]),
         np.array([[7, 2.2, 0.1], [8, 3, 0]]),
@@ -169,7 +169,7 @@ def test_what_was_seen_once_is_no_landmark():
     assert cells.n == len(ring)
 
 
-def test_who_was_carried_is_told_by_known_landmarks_where_it_is():
+def test_a_kidnapped_robot_relocalises_by_known_landmarks():
     cells, _ = taught()
     there = np.array([1.5, -1.0])
     places = {k: 2.0 * np.array([math.cos(a), math.sin(a)]) for k, a in
@@ -225,7 +225,7 @@ def test_views_can_be_landmarks(drive):
         (np.array([[1.0, -1.0, 0.0]]), "negative or not a number"),
     ],
 )
-def test_what_no_landmark_can_be_is_refused_and_changes_nothing(rows, said, drive):
+def test_an_invalid_landmark_is_refused_and_changes_nothing(rows, said, drive):
     brain = lives(brain_of(), drive[:10])
     before = {name: value.clone() for name, value in brain.state_dict().items()}
     with pytest.raises(BadFrame, match=f"frame 10: .*{said}"):
@@ -339,7 +339,7 @@ def test_no_walls_and_no_landmarks_may_be_empty_lists(drive):
     assert equal_states(*brains) == []
 
 
-def test_who_leaves_the_space_is_told_what_to_raise():
+def test_leaving_the_space_names_the_parameter_to_raise():
     brain = brain_of("semantic", semantic={"space": {"reach_m": 2.0}})
     with pytest.raises(MapError, match=r"outside of its space of \+-2 m; raise semantic.space"):
         lives(brain, [Frame(i, 0.1 * i, velocity=Velocity(1.0, 0.0)) for i in range(100)])

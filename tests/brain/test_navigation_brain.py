@@ -152,7 +152,7 @@ def test_verify_finds_what_makes_no_sense(squares, tmp_path):
 
 
 @pytest.mark.parametrize("arena", ["triangle", "circle2m", "nonagon"])
-def test_who_was_carried_says_that_it_is_lost_and_learns_nothing_then(arena):
+def test_a_kidnapped_animal_reports_that_it_is_lost_and_learns_nothing(arena):
     frames = list(open_source(f"arena:{arena}?minutes=8&noise=1&seed=1"))
     start, place = 4800, np.array([f.truth[:2] for f in frames])
     brain = brain_of("slrb")
@@ -179,7 +179,7 @@ def test_who_was_carried_says_that_it_is_lost_and_learns_nothing_then(arena):
 
 
 @pytest.mark.parametrize("carried", ["detect", "ignore"])
-def test_who_sees_recovers_from_being_carried(carried):
+def test_a_kidnapped_animal_with_views_relocalises(carried):
     source = open_source("world:ellipse?laps=3&noise=0.03&ranges=180")
     frames = list(source.frames(0, 801)) + list(source.frames(1000, 1201))
     brain = brain_of("ratslam_slrb", sessions={"kidnapped": carried})
@@ -266,7 +266,7 @@ def test_two_sessions_in_one_arena_become_one_map(squares):
     assert away.min() >= 0.06 - 1e-9  # no place twice
 
 
-def test_who_goes_on_after_a_merge_knows_where_it_is(squares, lived):
+def test_an_animal_that_continues_after_a_merge_is_localised(squares, lived):
     _, (told, truth, _) = lived("arena:square?minutes=7&noise=1&seed=1", 6000, "square 1")
     start = truth[0]
     assert np.linalg.norm(told[-1] + start - truth[-1]) < 0.1
@@ -281,7 +281,7 @@ def test_who_goes_on_after_a_merge_knows_where_it_is(squares, lived):
 
 def test_a_merge_with_itself_adds_nothing(squares):
     merged, reports = join_brains(squares[0], squares[0])
-    assert reports[0].reason == "nothing is new: every experience was known"
+    assert reports[0].reason == "no experience is new"
     assert merged.map.n == squares[0].map.n
     assert torch.equal(merged.navigation.walls.n_walls, squares[0].navigation.walls.n_walls)
 
@@ -329,7 +329,7 @@ def test_an_outline_is_found_again_wherever_it_was_put(turn):
     np.testing.assert_allclose(moved.moved(laid.turn_rad, laid.move_m).feet_m, feet, atol=1e-6)
 
 
-def test_a_stored_map_without_views_waits_for_the_merge_and_says_so(squares):
+def test_a_stored_map_without_views_refers_to_neuroslam_merge(squares):
     brain = brain_of("slrb")
     brain.store(squares[0])
     lives(brain, open_source("arena:square?minutes=0.5&noise=1&seed=9"))

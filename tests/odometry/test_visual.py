@@ -152,9 +152,9 @@ def test_it_resumes_bit_for_bit():
     expected = [whole(image, DT) for image in images]
     for cut in range(6):
         before, after = VisualOdometry(OdometryConfig()), VisualOdometry(OdometryConfig())
-        said = [before(image, DT) for image in images[:cut]]
+        motions = [before(image, DT) for image in images[:cut]]
         after.load_state_dict({k: v.clone() for k, v in before.state_dict().items()})
-        assert said + [after(image, DT) for image in images[cut:]] == expected
+        assert motions + [after(image, DT) for image in images[cut:]] == expected
 
 
 def test_the_state_is_replaced_and_not_written_over():

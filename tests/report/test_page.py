@@ -128,7 +128,7 @@ def test_the_arrays_arrive_as_they_were(page, runs):
 def test_a_click_on_a_place_shows_its_picture_template_links_and_visits(page):
     page.mouse.click(*on_screen(page, 20))
     panel = page.locator("#place")
-    assert panel.locator("h3").first.inner_text() == "Place 20"
+    assert panel.locator("h3").first.inner_text() == "Experience 20"
     image = panel.locator("img")
     assert image.evaluate("picture => picture.complete && picture.naturalWidth") == 96
     canvas = panel.locator("canvas.template")
@@ -152,7 +152,7 @@ def test_a_link_leads_to_the_next_place(page):
     assert other in page.evaluate(
         "known.linksOf[20].flatMap(l => [run.link_from[l], run.link_to[l]])"
     )
-    assert page.locator("#place h3").first.inner_text() == f"Place {other}"
+    assert page.locator("#place h3").first.inner_text() == f"Experience {other}"
 
 
 def test_the_slider_shows_the_frame_and_the_path_up_to_it(page):
@@ -229,7 +229,7 @@ def test_everything_can_be_reached_by_keys(page):
     page.keyboard.press("n")
     page.keyboard.press("n")
     assert page.evaluate("chosen.place") == 1
-    assert page.locator("#said").inner_text().startswith("Place 1, ")
+    assert page.locator("#said").inner_text().startswith("Experience 1, ")
     page.keyboard.press("p")
     assert page.evaluate("chosen.place") == 0
     view = page.evaluate("({...map.view})")
@@ -377,3 +377,25 @@ def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):
     place = page.evaluate("map.nearest(400, 300, 1e9)")
     page.mouse.click(*on_screen(page, place))
     assert page.evaluate("chosen.place") == place
+
+
+def test_populations_show_their_counts_and_their_pictures_as_they_are(show, tmp_path):
+    config = BrainConfig(cells="pose+head_direction+speed")
+    run(WORLD, tmp_path / "run", config, stop=30, tensorboard=False)
+    write_report(tmp_path / "run")
+    page = show(tmp_path / "run" / "report.html")
+    cards = page.locator("#population-list .card")
+    assert cards.locator("h3").all_inner_texts() == ["head direction", "speed"]
+    assert cards.nth(1).locator("dd").first.inner_text() == "32"
+    images = page.locator("#population-list img")
+    sizes = images.evaluate_all("all => all.map(i => [i.naturalWidth, i.naturalHeight, i.width])")
+    assert sizes == [[65, 65, 260], [32, 1, 256]]
+    assert set(images.evaluate_all("all => all.map(i => getComputedStyle(i).imageRendering)")) == {
+        "pixelated"
+    }
+    assert page.locator("#to-populations").is_visible()
+
+
+def test_where_the_page_draws_all_populations_itself_there_is_no_such_section(page):
+    assert not page.locator("#populations").is_visible()
+    assert not page.locator("#to-populations").is_visible()

@@ -179,7 +179,7 @@ def test_pictures_stay_within_their_budget(runs):
     some = take_pictures(finished, 30_000)
     size = sum(base64_size(len(file)) for file in some.files)
     assert 15_000 < size <= 30_000
-    assert "to keep it small" in some.notes[0]
+    assert "to limit its size" in some.notes[0]
     frames = some.row[:, 0]
     assert frames[0] == 0
     assert frames[-1] == len(finished.actions) - 1
@@ -192,7 +192,7 @@ def test_pictures_stay_within_their_budget(runs):
 def test_a_page_without_pictures_is_small(runs, pages, tmp_path):
     small = write_report(runs / "whole", tmp_path / "small.html", pictures_mb=0)
     assert small.stat().st_size < min(250_000, pages["whole"].stat().st_size)
-    assert "left out" in Page(small).about["picture_notes"][0]
+    assert "without pictures" in Page(small).about["picture_notes"][0]
 
 
 def test_where_the_source_is_gone_the_page_says_so(tmp_path, runs):
@@ -207,7 +207,7 @@ def test_where_the_source_is_gone_the_page_says_so(tmp_path, runs):
     shutil.rmtree(folder)
     after = Page(write_report(tmp_path / "out"))
     name = f"{tmp_path.name}/pictures"
-    assert after.about["picture_notes"] == [f"No pictures of {name}: it cannot be opened any more."]
+    assert after.about["picture_notes"] == [f"No pictures of {name}: it can no longer be opened."]
     assert after.pictures == []
     assert after.arrays["templates"].tobytes() == before.arrays["templates"].tobytes()
 
@@ -299,8 +299,8 @@ def test_places_of_a_map_whose_run_is_gone_have_no_pictures(runs, tmp_path):
     own = page.arrays["place_session"] == 1
     assert ((page.arrays["place_picture"] >= 0) == own).all()
     assert page.about["picture_notes"] == [
-        f"No pictures of {(~own).sum()} places: the run of the session that made them is not "
-        "where it was."
+        f"No pictures of {(~own).sum()} experiences: the folder of the run that made them "
+        "has been moved or deleted."
     ]
 
 
@@ -342,7 +342,7 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
     assert not nowhere[40:].any()
     assert (page.arrays["row_place"] == -1).tolist() == nowhere.tolist()
     (left,) = page.about["not_joined"]
-    assert "looked like one of it" in left["reason"]
+    assert "matched by view" in left["reason"]
     began = [session["began"] for session in page.about["sessions"]]
     assert "kidnapped" in began
     written = (Path(collect.__file__).parent / "tables.js").read_text()
@@ -425,7 +425,7 @@ def damaged(runs, tmp_path, name, change):
     [
         ("metrics.json", lambda p: p.unlink(), "metrics.json: missing"),
         ("metrics.json", lambda p: p.write_text("{}"), "metrics.json: damaged"),
-        ("config.toml", lambda p: p.unlink(), "config.toml: is missing"),
+        ("config.toml", lambda p: p.unlink(), "config.toml: missing"),
         ("frames.csv", lambda p: p.unlink(), "frames.csv: missing"),
         ("frames.csv", lambda p: p.write_text("frame\n0\n"), "frames.csv: damaged"),
         ("frames.csv", lambda p: p.write_bytes(b"\xff\xfe\n\xff"), "frames.csv: damaged"),

@@ -80,7 +80,7 @@ def test_jobs_below_one_are_a_mistake():
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(RunError, match=r"pip install neuroslam\[sweep\], or leave --ray out"):
+    with pytest.raises(RunError, match=r"pip install neuroslam\[sweep\], or omit --ray"):
         parallel_map(abs, [1], ray="local")
 
 

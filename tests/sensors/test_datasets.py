@@ -153,7 +153,7 @@ def test_real_kitti_poses_lie_on_the_ground(shared, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "damage", "said"),
+    ("make", "damage", "message"),
     [
         (tum, lambda d: (d / "groundtruth.txt").write_text("1 2 3"), "expected 8 numbers"),
         (tum, lambda d: (d / "rgb.txt").write_text("# nothing"), "lists no images"),
@@ -164,10 +164,10 @@ def test_real_kitti_poses_lie_on_the_ground(shared, tmp_path):
         (euroc, lambda d: (d / "mav0/cam0/sensor.yaml").write_text("T_BS: 3"), "no T_BS"),
     ],
 )
-def test_a_damaged_dataset_is_one_line(make, damage, said, tmp_path):
+def test_a_damaged_dataset_is_one_line(make, damage, message, tmp_path):
     folder = make(tmp_path / "data")
     damage(folder)
-    with pytest.raises(SourceError, match=said) as caught:
+    with pytest.raises(SourceError, match=message) as caught:
         open_source(folder)
     assert "\n" not in str(caught.value)
 
@@ -343,7 +343,7 @@ def test_a_camera_gives_images_at_the_times_they_come(monkeypatch):
     assert absolute_spec("camera:0") == "camera:0"
 
 
-def test_what_a_camera_showed_is_not_looked_for_later(monkeypatch, tmp_path):
+def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_path):
     monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
     small = ["--set", "view.template_width=16", "--set", "odometry.max_shift_px=8"]
     out = tmp_path / "out"

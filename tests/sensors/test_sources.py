@@ -183,11 +183,11 @@ def test_a_damaged_png_is_refused_without_a_word_of_the_decoder(tmp_path, capfd)
     assert capfd.readouterr().err == ""
 
 
-def test_a_change_of_size_is_told_with_both_sizes_wherever_one_starts(tmp_path):
+def test_a_change_of_size_is_reported_with_both_sizes_wherever_one_starts(tmp_path):
     folder = fill(tmp_path / "f", 4)
     (folder / "2.png").write_bytes(encoded(2, width=40, height=30))
-    said = refused(folder)
-    assert "frame 2 (2.png) is 40 x 30 px; expected 32 x 24 px" in said
+    message = refused(folder)
+    assert "frame 2 (2.png) is 40 x 30 px; expected 32 x 24 px" in message
     with pytest.raises(BadFrame, match="frame 2"):
         list(open_source(folder).frames(start=2))
     assert [f.index for f in open_source(folder).frames(1, 4, [].append)] == [1, 3]
@@ -311,7 +311,7 @@ for path in sys.argv[1:]:
     except ValueError as error:
         print(error)
 """
-    # Another process: FFmpeg is told once, when it is first used, how much to say.
+    # Another process: FFmpeg reads its log level once, on first use.
     done = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "cut.avi", tmp_path / "text.mp4"],
         capture_output=True,
@@ -364,8 +364,8 @@ def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_
     path = tmp_path / "m.csv"
     for wrong in ("nan", "inf", ""):
         path.write_text(f"v_m_s,w_rad_s\n1,0\n\n{wrong},0.5\n1,0\n")
-        said = refused(path)
-        assert "m.csv: frame 1 (line 4): its motion is v = " in said
+        message = refused(path)
+        assert "m.csv: frame 1 (line 4): its motion is v = " in message
         assert [f.index for f in open_source(path).frames(on_bad_frame=[].append)] == [0, 2]
 
 
@@ -386,9 +386,9 @@ def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_
 )
 def test_a_motion_table_that_cannot_be_used_says_why(tmp_path, text, fault):
     (tmp_path / "m.csv").write_text(text)
-    said = refused(tmp_path / "m.csv")
-    assert "m.csv" in said
-    assert fault in said
+    message = refused(tmp_path / "m.csv")
+    assert "m.csv" in message
+    assert fault in message
 
 
 def test_a_table_that_is_not_text_is_refused(tmp_path):
@@ -476,7 +476,7 @@ def test_what_numpy_did_not_write_is_not_called_a_pickle(name, tmp_path):
     assert refused(path) == (f"{path}: is not an .npz or .npy file; expected one written by numpy")
 
 
-def test_an_address_is_told_as_typed_and_stays_what_it_is():
+def test_an_address_is_reported_as_typed_and_stays_unchanged():
     address = "http://example.com/x.mp4"
     assert refused(address).startswith(
         f"{address}: is an address; open it as a camera: camera:http"

@@ -151,7 +151,7 @@ def test_what_is_sensed_is_that_of_a_sample_within_half_a_period_or_none():
     assert all((f.truth is None) == (f.heading_rad is None) for f in frames)
 
 
-def test_the_motion_source_is_believed_before_the_camera():
+def test_the_motion_source_has_priority_over_the_camera():
     times = np.arange(4.0)
     camera = camera_at(times, 1.0, truth=Pose(1, 1, 1), ranges=np.ones(3))
     motion = motion_at(times, rate=1.0, truth=Pose(2, 2, 2), walls=np.zeros((1, 2)))
@@ -190,7 +190,7 @@ def test_no_more_is_read_ahead_than_a_frame_of_each():
         assert motion.made <= np.sum(moved <= frame.time_s + 1e-6) + 1
 
 
-def test_a_bad_frame_is_raised_or_left_out_and_told_once():
+def test_a_bad_frame_is_raised_or_skipped_and_reported_once():
     seen, moved = np.arange(10) / 5.0, np.arange(20) / 10.0
     camera, motion = camera_at(seen), motion_at(moved, np.column_stack([moved, moved]))
     camera.listed[3], motion.listed[10] = "camera: frame 3 is torn", "motion: frame 10 is mad"
@@ -227,13 +227,13 @@ def test_sources_that_do_not_overlap_are_refused_with_both_ranges():
         )
 
 
-def test_a_video_whose_end_is_unknown_is_refused_when_it_has_been_read(tmp_path):
+def test_a_video_of_unknown_length_is_refused_after_reading(tmp_path):
     film(tmp_path / "a.mkv", 9, 10.0, "mp4v")
     log(tmp_path / "m.csv", np.arange(5.0, 9.0))
     source = open_source(f"{tmp_path}/a.mkv+{tmp_path}/m.csv")
-    said = refused(lambda: list(source))
-    assert "a.mkv runs from 0 s to 0.8 s" in said
-    assert "m.csv runs from 5 s to 8 s" in said
+    message = refused(lambda: list(source))
+    assert "a.mkv runs from 0 s to 0.8 s" in message
+    assert "m.csv runs from 5 s to 8 s" in message
 
 
 def test_images_before_and_after_the_motion_are_counted():
@@ -287,8 +287,8 @@ def test_a_file_with_a_plus_in_its_name_is_that_file(tmp_path, monkeypatch):
     merged = open_source("a+b.csv+c+d.avi")
     assert isinstance(merged, Streams)
     assert [f.time_s for f in merged] == [0.0, 1.0]
-    said = refused(lambda: open_source("a+b.csv+none.avi"))
-    assert "a+b.csv+none.avi: a+b.csv exists, 'none.avi' does not" in said
+    message = refused(lambda: open_source("a+b.csv+none.avi"))
+    assert "a+b.csv+none.avi: a+b.csv exists, 'none.avi' does not" in message
 
 
 def test_a_camera_may_be_merged_with_a_walk_and_its_walls(tmp_path):

@@ -77,7 +77,7 @@ def test_brightness_of_features_does_not_matter_and_silence_is_grey():
 
 
 @pytest.mark.parametrize("grey", [False, True])
-def test_a_place_is_learnt_once_and_recognised_after(grey):
+def test_a_view_is_learnt_once_and_matched_afterwards(grey):
     cells = LocalViewCells(ViewConfig(**SMALL), filters())
     images = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
     first, again = [[cells(p) for p in images] for _ in range(2)]
@@ -144,7 +144,7 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
 
 
 @pytest.mark.parametrize(
-    ("features", "weights", "said"),
+    ("features", "weights", "message"),
     [
         ("squeezenet1_1", "none.pth", "no such file"),
         ("squeezenet1_1", "text.pth", "cannot be read; expected the state_dict"),
@@ -154,24 +154,24 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
         ("resnet18", "squeezenet.pth", "not of resnet18"),
     ],
 )
-def test_what_is_wrong_with_weights_is_said(features, weights, said, squeezenet):
+def test_errors_of_weights_are_reported(features, weights, message, squeezenet):
     (squeezenet / "text.pth").write_text("no weights")
     torch.save([torch.zeros(2)], squeezenet / "list.pth")
-    with pytest.raises(ConfigError, match=said) as error:
+    with pytest.raises(ConfigError, match=message) as error:
         load_network(features, squeezenet / weights)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("view", "said"),
+    ("view", "message"),
     [
         ({"features": "resnet18"}, "features resnet18 needs weights"),
         ({"weights": "a.pth"}, "weights belong to a named network, but features is grey"),
         ({"features": "module", "weights": "a.pth"}, "and features is module"),
     ],
 )
-def test_name_and_weights_belong_together(view, said):
-    with pytest.raises(ValueError, match=said):
+def test_name_and_weights_belong_together(view, message):
+    with pytest.raises(ValueError, match=message):
         ViewConfig(**view)
 
 
@@ -185,7 +185,7 @@ class Gives(nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("found", "error", "said"),
+    ("found", "error", "message"),
     [
         (torch.zeros(1, 4, 5), ConfigError, r"returns \(1, 4, 5\); expected features"),
         ({"out": 1}, ConfigError, "returns dict; expected features"),
@@ -194,8 +194,8 @@ class Gives(nn.Module):
         (nn.Conv2d(3, 4, 200), ConfigError, "fails on an image of 96x64 px"),
     ],
 )
-def test_what_is_wrong_with_a_network_is_said(found, error, said):
-    with pytest.raises(error, match=said):
+def test_errors_of_a_network_are_reported(found, error, message):
+    with pytest.raises(error, match=message):
         LocalViewCells(ViewConfig(**SMALL), Gives(found))(texture())
 
 
@@ -279,7 +279,7 @@ def test_after_a_gap_the_network_makes_the_views_of_a_new_map(tour):
     assert brain.view.network_digest == brain.stored[0].view.network_digest != 0
 
 
-def test_networks_without_weights_are_told_apart_by_their_parts():
+def test_networks_without_weights_are_distinguished_by_their_parts():
     pooled = [FeatureEncoder(ViewConfig(**SMALL), nn.AvgPool2d(size)).digest for size in (4, 8, 4)]
     assert pooled[0] == pooled[2] != pooled[1]
 
@@ -316,7 +316,7 @@ def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(
         load_network("swin_t.features", path)
 
 
-def test_a_network_that_reckons_with_tensors_can_be_made(tmp_path):
+def test_a_network_that_computes_its_widths_with_tensors_can_be_made(tmp_path):
     path = weights_of("regnet_y_400mf", tmp_path)
     assert load_network("regnet_y_400mf.trunk_output", path)(torch.rand(1, 3, 64, 64)).ndim == 4
 
@@ -371,8 +371,8 @@ def test_a_run_with_a_network(call, mistake, squeezenet, tmp_path, monkeypatch):
     monkeypatch.chdir(elsewhere)  # the weights are where they were
     assert call("resume", tmp_path / "near", "--stop", 12).code == 0
     missing = ["--set", "view.weights=none.pth"]
-    said = mistake("run", WORLD, "--out", tmp_path / "other", *given, *missing)
-    assert f"view.weights = '{elsewhere / 'none.pth'}': no such file" in said
+    message = mistake("run", WORLD, "--out", tmp_path / "other", *given, *missing)
+    assert f"view.weights = '{elsewhere / 'none.pth'}': no such file" in message
 
 
 def test_networks_are_compared_on_the_corridor(shared, squeezenet, tmp_path, mistake):
@@ -383,7 +383,7 @@ def test_networks_are_compared_on_the_corridor(shared, squeezenet, tmp_path, mis
     assert [(row["width_px"], row["height_px"]) for row in rows] == [(16, 64), (32, 24)]
     # Weights that were not learnt tell more than chance, 0.11, and less than grey does.
     assert all(0.2 < row["pairs_average_precision"] < 0.5 for row in rows)
-    said = mistake("experiment", "compare", "--out", tmp_path, "--network", f"{name}=x.pth")
-    assert "compares no views; leave --network out" in said
-    said = mistake("experiment", "view-matching", "--out", tmp_path, "--network", name)
-    assert "expected NAME=FILE" in said
+    message = mistake("experiment", "compare", "--out", tmp_path, "--network", f"{name}=x.pth")
+    assert "compares no views; leave --network out" in message
+    message = mistake("experiment", "view-matching", "--out", tmp_path, "--network", name)
+    assert "expected NAME=FILE" in message

@@ -28,7 +28,7 @@ def random_image(seed=0, height=64, width=96):
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def test_a_place_is_learnt_once_and_recognised_after():
+def test_a_view_is_learnt_once_and_matched_afterwards():
     cells = LocalViewCells(ViewConfig(**SMALL))
     first = [cells(random_image(seed)) for seed in range(10)]
     again = [cells(random_image(seed)) for seed in range(10)]
@@ -40,7 +40,7 @@ def test_a_place_is_learnt_once_and_recognised_after():
 
 
 @pytest.mark.parametrize("name", ["circuit_launch", "usi_track1"])
-def test_a_real_drive_is_told_apart_as_by_the_reference(shared, name):
+def test_templates_of_a_real_drive_are_those_of_the_reference(shared, name):
     """Of C++ OpenRatSLAM on the same frames, every id is equal and every error."""
     refs = shared / "refs" / "ratslam"
     cells = LocalViewCells(resolve_config("openratslam", refs / f"config_{name}.ini").view)
@@ -177,7 +177,7 @@ def test_state_dict_is_complete(config):
         assert torch.equal(a, b), name
 
 
-def test_a_template_takes_at_most_700_bytes_all_told():
+def test_a_template_takes_at_most_700_bytes_in_total():
     view = LocalViewCells(ViewConfig(template_width=60, template_height=10, shift_match=5))
     tables = (view.templates, PoseCellNetwork(PoseCellConfig()).bindings)
     sizes = sum(
@@ -188,7 +188,7 @@ def test_a_template_takes_at_most_700_bytes_all_told():
     assert sizes <= 700
 
 
-def test_a_template_can_be_looked_at():
+def test_a_template_can_be_read_as_an_image():
     cells = LocalViewCells(ViewConfig(**SMALL))
     cells(random_image(2))
     wanted = np.rint(encode(random_image(2), cells.config).template * 255)
@@ -238,7 +238,7 @@ def test_a_view_of_another_size_is_neither_compared_nor_stored():
 
 
 @pytest.mark.parametrize("template", [-1, 1])
-def test_a_template_that_is_not_there_cannot_be_looked_at(template):
+def test_reading_a_missing_template_is_an_error(template):
     cells = LocalViewCells(ViewConfig(**SMALL))
     cells(random_image())
     with pytest.raises(MapError, match=f"no template {template}; there are 1"):

@@ -250,7 +250,7 @@ def test_places_look_different(name):
                 assert np.abs(images[i] - images[j]).mean() > 8
 
 
-def test_people_change_images_but_not_truth():
+def test_pedestrians_change_images_but_not_truth():
     empty, busy = open_world("world:corridor"), open_world("world:corridor?people=6")
     assert np.array_equal(empty.truths(), busy.truths())
     changed = [
@@ -263,7 +263,7 @@ def test_people_change_images_but_not_truth():
     assert not np.array_equal(busy.frame(0).image, busy.frame(lap).image)
 
 
-def test_a_person_behind_a_wall_is_not_seen():
+def test_a_pedestrian_behind_a_wall_is_not_visible():
     world, camera = build_world("corridor"), Camera(160, 64)
     here, kind = Pose(0.0, -3.25, 0.0), world.people[0][0]
     billboard = type(world.billboards[0])
@@ -315,7 +315,7 @@ def test_a_campus_drive_can_be_twenty_thousand_frames_long():
     assert source.frame(source.n_frames - 1).image.std() > 15
 
 
-def test_every_world_says_what_it_is():
+def test_every_world_has_a_description():
     for name, line in catalogue().items():
         assert 20 < len(line) < 100
         assert build_world(name).description == line
@@ -324,9 +324,9 @@ def test_every_world_says_what_it_is():
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("world:coridor", "world 'coridor': there is none; there are corridor, ellipse, .*"
+        ("world:coridor", "world 'coridor': no such world; expected one of corridor, ellipse, .*"
          "; did you mean 'corridor'?"),
-        ("world:", "world '': there is none; there are corridor, .*"),
+        ("world:", "world '': no such world; expected one of corridor, .*"),
         ("world:town?lapps=2", "world 'town': unknown option 'lapps'; there are laps, start, .*"
          "; did you mean 'laps'?"),
         ("world:town?laps", "world 'town': option 'laps' has no value; write laps=VALUE once"),
@@ -337,13 +337,13 @@ def test_every_world_says_what_it_is():
         ("world:town?route=7", "world 'town': route 7 does not exist; expected 1 to 6"),
     ],
 )  # fmt: skip
-def test_mistakes_are_told_in_one_line(spec, message):
+def test_mistakes_are_one_line_errors(spec, message):
     with pytest.raises(SourceError, match=f"^{message.replace('?', '[?]')}$") as caught:
         open_world(spec)
     assert "\n" not in str(caught.value)
 
 
-def test_a_frame_that_is_not_there_is_told():
+def test_a_missing_frame_is_an_error():
     source = WorldSource("corridor", WorldOptions(laps=0.1))
     with pytest.raises(SourceError, match="world:corridor: no frame 99; expected 0 to 34"):
         source.frame(99)
