@@ -174,7 +174,7 @@ def move_points(points_m: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
         array([[5., 6.]])
     """
     turn_rad = end.theta_rad - start.theta_rad
-    return rotate_points(points_m - np.array(start[:2]), turn_rad) + np.array(end[:2])
+    return np.asarray(rotate_points(points_m - np.array(start[:2]), turn_rad) + np.array(end[:2]))
 
 
 def integrate_velocities(

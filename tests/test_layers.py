@@ -87,7 +87,7 @@ def test_every_file_is_in_a_room_of_the_plan_and_no_room_has_a_second_floor():
 
 def test_the_tests_mirror_the_rooms():
     folders = {p.parent.name for p in Path(__file__).parent.rglob("test_*.py")} - {"tests"}
-    assert folders <= LEVEL.keys()
+    assert folders - {"docs", "typing"} <= LEVEL.keys()  # those two are of no room
 
 
 def test_torchvision_is_imported_through_one_door():

@@ -181,7 +181,7 @@ def _rotated(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
     q = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     axis, w = q[:, :3], q[:, 3:]
     across = np.cross(axis, vector)
-    return vector + 2.0 * (w * across + np.cross(axis, across))
+    return np.asarray(vector + 2.0 * (w * across + np.cross(axis, across)))
 
 
 def _on_ground(

@@ -81,7 +81,7 @@ def rising(times_s: np.ndarray) -> np.ndarray:
         >>> rising(np.array([0.0, 0.5, 0.25, np.nan, 1.0])).tolist()
         [True, True, False, False, True]
     """
-    return np.isfinite(times_s) & (times_s > _latest_before(times_s))
+    return np.asarray(np.isfinite(times_s) & (times_s > _latest_before(times_s)))
 
 
 def _latest_before(times_s: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
     sums = rows[:, ::block_w].copy()  # adding columns is faster than reducing a short axis
     for column in range(1, block_w):
         sums += rows[:, column::block_w]
-    return sums / (255.0 * block_h * block_w)
+    return np.asarray(sums / (255.0 * block_h * block_w))
 
 
 def normalise_mean(view: np.ndarray, mean: float) -> np.ndarray:
@@ -127,7 +127,7 @@ def normalise_patches(view: np.ndarray, radius: int, min_std: float) -> np.ndarr
     std[flat] = 1.0
     normalised = np.clip((centred - mean) / (6.0 * std) + 0.5, 0.0, 1.0)
     normalised[flat] = 0.5
-    return normalised
+    return np.asarray(normalised)
 
 
 def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:

@@ -133,7 +133,7 @@ def template_blocks(template: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Return the block means of a template, ``(width, height)``, for the search."""
     if not geometry.n_blocks:
         return np.empty(0, np.uint8)
-    return block_means(template[None, slice(*geometry.core)], geometry)[0]
+    return np.asarray(block_means(template[None, slice(*geometry.core)], geometry)[0])
 
 
 def find_nearest(

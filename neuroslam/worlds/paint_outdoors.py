@@ -244,7 +244,7 @@ def sky(rng: np.random.Generator) -> np.ndarray:
     for height, colour in ((30.0, (136, 158, 172)), (14.0, (92, 124, 98))):
         ridge = height * (1.0 + 0.6 * _around(rng, 1, w, (1.0, 60.0))[0])
         image[np.arange(h)[::-1, None] < ridge[None]] = colour
-    return np.clip(image, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(image, 0, 255).astype(np.uint8))
 
 
 def _around(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, float]) -> np.ndarray:

@@ -358,7 +358,7 @@ class WorldSource(IndexedSource):
         distance = np.where(wrong, elsewhere[0], distance * (1.0 + noise[0]))
         bearing = np.where(wrong, elsewhere[1], bearing + noise[1])
         number = np.arange(len(seen)) if options.labels else np.full(len(seen), -1)
-        return np.column_stack([number, np.maximum(distance, 0.0), bearing])[visible]
+        return np.asarray(np.column_stack([number, np.maximum(distance, 0.0), bearing])[visible])
 
     def _measure(self, index: int, pose: Pose) -> np.ndarray:
         options = self.options

@@ -432,7 +432,7 @@ def test_a_bad_compass_is_refused_before_anything_changes():
 )
 def test_activity_that_is_none_is_refused(activity, said):
     with pytest.raises(MapError, match=said):
-        HeadDirectionCells().restore(activity)
+        HeadDirectionCells().set_activity(activity)
 
 
 @pytest.mark.parametrize("wrong", [{"n": 4}, {"settle_s": 0.0}, {"inhibition": 2.0}, {"m": 1}])

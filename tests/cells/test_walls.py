@@ -444,7 +444,7 @@ def test_motion_that_cannot_be_is_refused_in_one_line(speed, heading):
     with pytest.raises(BadFrame) as caught:
         check_motion(torch.tensor(speed), torch.tensor(heading))
     assert str(caught.value) == (
-        f"motion: speed {speed:g} m/s, heading {heading:g} rad; expected finite numbers"
+        f"motion: speed {speed:.6} m/s, heading {heading:.6} rad; expected finite numbers"
     )
 
 

@@ -101,7 +101,7 @@ def sources(tmp_path_factory):
         ("empty.csv", r"empty\.csv: "),
         ("nan.csv", r"nan\.csv: frame 0 \(line 2\): its motion is v = nan m/s"),
         ("short.csv", r"short\.csv: line 2 "),
-        ("world:corridr", r"world 'corridr': there is none.*did you mean 'corridor'\?"),
+        ("world:corridr", r"world 'corridr': no such world.*did you mean 'corridor'\?"),
         ("arena:cirle2m", r"no arena is named 'cirle2m'.*did you mean 'circle2m'\?"),
         (
             "http://example.com/x.mp4",
@@ -227,7 +227,9 @@ def test_a_truncated_video_is_mapped_as_far_as_it_goes(tmp_path, call):
     stopped = call("run", tmp_path / "cut.avi", "-o", tmp_path / "stop", QUICK)
     assert stopped.code == 2
     assert stopped.err.count("\n") == 1
-    assert re.search(r"cut\.avi: frame \d+ .*truncated\?", stopped.err), stopped.err
+    assert re.search(r"cut\.avi: frame \d+ is missing; .*file is complete", stopped.err), (
+        stopped.err
+    )
     frames = len(read_frames(tmp_path / "stop")["frame"])
     assert 5 < frames < 15
     skipped = call(
@@ -263,7 +265,7 @@ def test_a_source_whose_every_frame_is_bad_has_no_usable_frame(earlier, tmp_path
 
 def test_an_empty_name_is_no_source(sources, tmp_path, monkeypatch, mistake):
     monkeypatch.chdir(sources / "good")
-    assert "the source has an empty name" in mistake("run", "", "-o", tmp_path / "out")
+    assert "the name of the source is empty" in mistake("run", "", "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -313,7 +315,7 @@ def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
 def test_a_run_is_not_overwritten_unasked(earlier, mistake):
     before = contents(earlier)
     said = mistake("run", WORLD, "-o", earlier)
-    assert re.search(rf"{earlier}: holds a run already.*; resume it, take another .*--over", said)
+    assert re.search(rf"{earlier}: holds a run already.*; resume it, choose another .*--over", said)
     assert contents(earlier) == before
 
 

@@ -90,7 +90,7 @@ def test_the_demo_replaces_no_run_but_a_demo(copy, says):
     before = contents(copy)
     code, _, err = says("demo", "-o", copy)
     assert code == 2
-    assert err == f"neuroslam demo: {copy}: holds a run of something else; take another folder\n"
+    assert err == f"neuroslam demo: {copy}: holds a run of another source; choose another folder\n"
     assert contents(copy) == before
 
 

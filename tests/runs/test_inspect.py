@@ -105,7 +105,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     brain, rows = load_brain(joined), inspect(joined)
     told = dict(rows)
     assert told["experiences"] == str(brain.map.n)
-    assert told["views"] == str(brain.view.n)
+    assert told["templates"] == str(brain.view.n)
     assert told["links"] == str(brain.map.n_links)
     assert told["loop closures"] == "1"  # where the two maps meet
     assert told["frames seen"] == "430"
@@ -126,7 +126,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     )
     assert told[f"session {second.name}"] == (
         f"{about}130 frames from frame 320, {made[second.id]} experiences "
-        f"({brain.map.aliases.n} of them known), began: start"
+        f"({brain.map.aliases.n} merged into those of other sessions), began: start"
     )
     text = told[f"merge at frame {merge['at_frame']}"]
     assert text.startswith(f"session {second.name} into {first.name}, 4 places agree, ")
@@ -143,7 +143,7 @@ def test_views_and_pose_cells_are_not_listed_for_a_brain_without(cells, tmp_path
     save_brain(NavigationBrain(BrainConfig(cells=cells)), tmp_path / "brain.safetensors")
     told = dict(inspect(tmp_path / "brain.safetensors"))
     assert told["cells"] == cells[0]
-    assert not {"view", "views", "pose cells"} & told.keys()
+    assert not {"view", "templates", "pose cells"} & told.keys()
 
 
 def put(name, row, value):

@@ -101,7 +101,7 @@ def test_values_override_the_preset_and_single_assignments():
         (["a.avi"], {}, RunError, "nothing is varied; give several sources, --vary or --seeds"),
         (["a.avi", "a.avi"], {}, RunError, "a source is given twice"),
         (["a.avi"], {"vary": ["view.threshold"]}, ConfigError, "expected key=a,b,c"),
-        (["a.avi"], {"vary": ["view.threshold=0.1,0.1"]}, ConfigError, "has a value twice"),
+        (["a.avi"], {"vary": ["view.threshold=0.1,0.1"]}, ConfigError, "a value occurs twice"),
         (["a.avi"], {"vary": ["map.loops=1", "map.loops=2"]}, ConfigError, "given twice"),
         (["a.avi"], {"vary": ["view.treshold=1,2"]}, ConfigError, "did you mean 'view.threshold'"),
         (["a.avi"], {"vary": ["view.treshold=1,2"]}, ConfigError, "--vary: unknown key"),
@@ -284,5 +284,5 @@ def test_names_stand_side_by_side_and_what_else_is_varied_is_in_the_legend():
 
 
 def test_a_sweep_in_which_all_failed_has_no_figure():
-    with pytest.raises(ValueError, match="got 1 rows, none of a run that went well"):
+    with pytest.raises(ValueError, match="got 1 rows, expected one of a run that succeeded"):
         plot_sweep([row(error="no such file")], ["source"])

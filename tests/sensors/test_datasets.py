@@ -349,7 +349,7 @@ def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_p
     out = tmp_path / "out"
     assert main(["run", "camera:0", "-o", str(out), "--stop", "5", "--no-tensorboard", *small]) == 0
     page = write_report(out).read_text()
-    assert "a live camera shows something else by now" in page
+    assert "a live source cannot be read again" in page
     with pytest.raises(RunError, match="camera:0: is live; tuning looks several times"):
         tune("camera:0", tmp_path / "tuned")
 

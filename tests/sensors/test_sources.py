@@ -497,7 +497,7 @@ def test_what_is_missing_or_of_no_known_kind_is_refused(tmp_path):
 def test_a_rendered_world_is_a_source_like_the_others():
     source = open_source("world:corridor?laps=1")
     assert next(iter(source.frames(7, 8, [].append))).index == 7
-    assert "world 'nowhere': there is none" in refused("world:nowhere")
+    assert "world 'nowhere': no such world" in refused("world:nowhere")
 
 
 def test_reading_a_source_twice_gives_the_same_and_stop_cuts_it(tmp_path):

@@ -17,7 +17,9 @@ from neuroslam.types import NO_TEMPLATE
 class VisitsConfig(Section):
     """Its parameters: the table [visits] of a config."""
 
-    away_s: float = Field(1.0, ge=0, description="a view that returns within it is the same visit")
+    away_s: float = Field(
+        default=1.0, ge=0, description="a view that returns within it is the same visit"
+    )
 
 
 def count(visits: Tensor, view: int) -> Tensor:
@@ -34,10 +36,6 @@ class Visits(Population):
     needs_views = True
     growing = ("visits",)
     merge_rules = {"visits": summed_by_view, "last": view_id, "since_s": about_now}
-
-    visits: Tensor
-    last: Tensor
-    since_s: Tensor
 
     def __init__(self, config: VisitsConfig | None = None) -> None:
         super().__init__()

@@ -54,7 +54,7 @@ def test_pyright_finds_no_error():
     if importlib.util.find_spec("pyright") is None:
         pytest.skip("pyright is not installed: pip install neuroslam[dev]")
     # It comes with what it runs: with nothing to fetch, it works without a network.
-    quiet = {"PYRIGHT_PYTHON_IGNORE_WARNINGS": "1", "PYRIGHT_PYTHON_GLOBAL_NODE": "0"}
+    quiet = {"PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
     command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | quiet, capture_output=True, text=True, check=False

@@ -167,7 +167,7 @@ def test_errors_of_weights_are_reported(features, weights, message, squeezenet):
     [
         ({"features": "resnet18"}, "features resnet18 needs weights"),
         ({"weights": "a.pth"}, "weights belong to a named network, but features is grey"),
-        ({"features": "module", "weights": "a.pth"}, "and features is module"),
+        ({"features": "module", "weights": "a.pth"}, "but features is module"),
     ],
 )
 def test_name_and_weights_belong_together(view, message):
@@ -341,9 +341,11 @@ def test_a_name_is_no_network():
 
 def test_maps_of_two_networks_are_not_merged(first, tour):
     other = lived(tour[:60], filters(seed=1))
-    assert "the weights of 'module', by which views were made" in find_match(first, other).reason
+    assert (
+        "the weights of the network of views, 'module', differ" in find_match(first, other).reason
+    )
     for brain in (other, NavigationBrain(config_of(), features=filters(seed=1))):
-        with pytest.raises(ConfigError, match="another config: the weights of 'module'"):
+        with pytest.raises(ConfigError, match="weights of the network of views, 'module'"):
             brain.store(first)
 
 
