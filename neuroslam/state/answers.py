@@ -55,7 +55,8 @@ def pictures_of(population: Population) -> dict[str, Picture]:
     pictures: dict[str, Picture] = {}
     for tag, picture in _named(population, "images", population.images()).items():
         layered = isinstance(picture, tuple | list)
-        layers = tuple(_array(layer) for layer in (picture if layered else (picture,)))
+        parts = picture if isinstance(picture, tuple | list) else (picture,)
+        layers = tuple(_array(layer) for layer in parts)
         coloured = [layer.dtype == np.uint8 and layer.shape[2:] == (3,) for layer in layers]
         if any(layer.ndim != 2 and (layered or not rgb)
                for layer, rgb in zip(layers, coloured, strict=True)):  # fmt: skip
