@@ -168,7 +168,7 @@ class NavigationBrain(BrainState):
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""
-        some = [(author, c) for author, c in made if moves_others(author, c)]
+        some = [(author, c) for author, c in made if c is not None and moves_others(author, c)]
         if not some:
             return
         leader = self.leader
