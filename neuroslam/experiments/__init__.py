@@ -21,6 +21,7 @@ EXPERIMENTS = {
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
     "compare": ("neuroslam.experiments.compare", "compare", None),
     "pixel-landmarks": ("neuroslam.experiments.compare", "pixel_landmarks", None),
+    "populations": ("neuroslam.experiments.populations", "populations", None),
     "boundary-scenarios": (
         "neuroslam.experiments.boundary_cells",
         "boundary_scenarios",

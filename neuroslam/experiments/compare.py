@@ -1,7 +1,7 @@
 """All methods side by side: one world, one noise, one seed, and the same frames for each."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -221,9 +221,21 @@ def config_of(method: str) -> BrainConfig:
     return build_config(merge_values(told, METHODS[method]), method)
 
 
-def live(config: BrainConfig, frames: Sequence[Frame]) -> Life:
-    """Let a brain take in a drive; the time is that of the brain alone."""
+def live(
+    config: BrainConfig,
+    frames: Sequence[Frame],
+    prepare: Callable[[NavigationBrain], None] | None = None,
+) -> Life:
+    """Let a brain take in a drive; the time is that of the brain alone.
+
+    Args:
+        config: Of the brain.
+        frames: Of the drive.
+        prepare: What is done to the brain before it.
+    """
     brain, at, cpu_s = NavigationBrain(config), [], 0.0
+    if prepare is not None:
+        prepare(brain)
     with one_thread(1), torch.inference_mode():
         for frame in frames:
             begin = time.process_time()

@@ -72,6 +72,37 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
+def plot_without(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw errors of the full brain and of the same with something less, a panel for each world.
+
+    Args:
+        rows: Of :func:`neuroslam.experiments.populations.populations`.
+    """
+    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    names = list(dict.fromkeys(row["without"] for row in rows))[::-1]
+    with mpl.rc_context(STYLE):
+        title = "The full brain, and what it loses without a part"
+        figure = new_figure(4.2 * len(worlds) + 1.8, 0.36 * len(names) + 1.6, title)
+        axes = figure.subplots(1, len(worlds), sharey=True, squeeze=False)[0]
+        for ax, world in zip(axes, worlds, strict=True):
+            mine = [row for row in rows if row["world"] == world]
+            for row in mine:
+                k, each = names.index(row["without"]), row["ate_each_m"]
+                ax.barh(k, row["ate_m"], color=MAP if k < len(names) - 1 else ROBOT, height=0.62)
+                ax.plot(each, [k] * len(each), "o", ms=4, mfc="white", mec=INK, zorder=3)
+                ax.annotate(
+                    f"{row['ate_m']:.2f}", (max(each), k), xytext=(6, 0),
+                    textcoords="offset points", va="center", fontsize=8,
+                )  # fmt: skip
+            ax.axvline(mine[0]["ate_m"], color=ROBOT, lw=1.0, ls="--", zorder=1)
+            _logarithmic(ax)
+            ax.set_xlabel("absolute trajectory error (m)")
+            ax.set_title(world)
+        axes[0].set_yticks(range(len(names)), names)
+        figure.supxlabel("bars: mean over drives; circles: each drive", fontsize=8)
+    return figure
+
+
 def _logarithmic(ax: Axes) -> None:
     """Make the axis logarithmic with few, plain numbers, and leave room for labels of bars."""
     ax.set_xscale("log")
