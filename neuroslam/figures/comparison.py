@@ -83,7 +83,7 @@ def plot_without(rows: Sequence[Mapping[str, Any]]) -> Figure:
     with mpl.rc_context(STYLE):
         title = "The full brain, and what it loses without a part"
         figure = new_figure(4.2 * len(worlds) + 1.8, 0.36 * len(names) + 1.6, title)
-        axes = figure.subplots(1, len(worlds), sharey=True, squeeze=False)[0]
+        axes = figure.subplots(1, len(worlds), sharex=True, sharey=True, squeeze=False)[0]
         for ax, world in zip(axes, worlds, strict=True):
             mine = [row for row in rows if row["world"] == world]
             for row in mine:
@@ -91,11 +91,11 @@ def plot_without(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 ax.barh(k, row["ate_m"], color=MAP if k < len(names) - 1 else ROBOT, height=0.62)
                 ax.plot(each, [k] * len(each), "o", ms=4, mfc="white", mec=INK, zorder=3)
                 ax.annotate(
-                    f"{row['ate_m']:.2f}", (max(each), k), xytext=(6, 0),
+                    f"{row['ate_m']:.2f}", (max(*each, mine[0]["ate_m"]), k), xytext=(6, 0),
                     textcoords="offset points", va="center", fontsize=8,
                 )  # fmt: skip
             ax.axvline(mine[0]["ate_m"], color=ROBOT, lw=1.0, ls="--", zorder=1)
-            _logarithmic(ax)
+            ax.set_xlim(0.0, 1.15 * max(max(row["ate_each_m"]) for row in rows))
             ax.set_xlabel("absolute trajectory error (m)")
             ax.set_title(world)
         axes[0].set_yticks(range(len(names)), names)
