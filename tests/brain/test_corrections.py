@@ -15,7 +15,7 @@ from torch import tensor
 from neuroslam.brain import NavigationBrain
 from neuroslam.brain.compass import Compass
 from neuroslam.cells.familiarity import Familiarity
-from neuroslam.cells.head_direction import HeadDirectionCells, Heard
+from neuroslam.cells.head_direction import CompassReading, HeadDirectionCells
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import (
@@ -116,7 +116,7 @@ def test_a_population_of_ones_own_is_told_the_displacement_in_its_own_frame(true
 @given(own=ANGLES, turn=SMALL, author=ANGLES)
 def test_head_direction_cells_turn_by_what_others_turn_whatever_the_frames(own, turn, author):
     cells = HeadDirectionCells()
-    cells.place(own)
+    cells.set_heading(own)
     cells.follow(Correction(0.3, 0.2, turn, heading_rad=author))
     assert wrap_angle(cells.heading_rad - own - turn) == pytest.approx(0.0, abs=1e-3)
 
@@ -131,11 +131,11 @@ def test_head_direction_cells_do_not_turn_when_others_only_move():
 @pytest.mark.parametrize("off", [0.2, -0.2])
 def test_head_direction_cells_tell_by_how_much_the_compass_has_turned_them(off):
     cells = HeadDirectionCells()
-    first = cells.step(STILL, Heard(1.0))
+    first = cells.step(STILL, CompassReading(1.0))
     assert first.turn_rad == 0.0  # the first reading says how the ring lies: nobody has to follow
     assert cells.heading_rad == pytest.approx(1.0, abs=1e-3)
     before = cells.heading_rad
-    told = cells.step(STILL, Heard(1.0 + off))
+    told = cells.step(STILL, CompassReading(1.0 + off))
     assert told == Correction(turn_rad=told.turn_rad)
     assert told.turn_rad == pytest.approx(cells.heading_rad - before, abs=1e-9)
     assert told.turn_rad == pytest.approx(off * -math.expm1(-0.1 / 2.0), rel=0.1)
