@@ -11,8 +11,8 @@ from neuroslam.experiments.compare import (
     METHODS,
     compare,
     config_of,
-    live,
     pixel_landmarks,
+    run_brain,
 )
 from neuroslam.figures.comparison import plot_losses
 from neuroslam.figures.style import render
@@ -66,9 +66,9 @@ def test_methods_are_what_their_names_say():
 def test_a_drive_without_a_camera_for_a_while_still_comes_home():
     spec = "world:corridor?width=64&height=40&frames_per_lap=120&noise=0.05&compass_deg=3&laps=2"
     more = "&ranges=36&markers=12&landmark_reach=6&dark=6-14"
-    dark = live(config_of("full"), list(open_source(spec + more)))
+    dark = run_brain(config_of("full"), list(open_source(spec + more)))
     assert dark.ate_m < 0.5
-    blind = live(config_of("RatSLAM"), list(open_source(spec + more)))
+    blind = run_brain(config_of("RatSLAM"), list(open_source(spec + more)))
     assert dark.ate_m < blind.ate_m
 
 

@@ -11,7 +11,7 @@ from neuroslam.config import BoundaryCellConfig, BrainConfig, GridCellConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import rate_map
 from neuroslam.experiments import boundary_cells, grid_cells, grid_comparison
-from neuroslam.experiments.census import Gatherer, arena_bins, by_seed, live_grid, median
+from neuroslam.experiments.census import CensusRecorder, arena_bins, by_seed, median, simulate_grid
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
@@ -107,12 +107,12 @@ def test_what_is_no_number_is_written_as_null(tmp_path):
 
 
 def test_a_census_scores_the_map_since_the_start_and_that_since_the_one_before(walk):
-    gatherer = Gatherer(walk, [120.0, 240.0], (1, 1, 2))
+    recorder = CensusRecorder(walk, [120.0, 240.0], (1, 1, 2))
     steady = hexagons(walk.positions, 0.5)
     drifts = np.where(walk.times_s <= 120.0, steady, hexagons(walk.positions + 0.15, 0.5))
     for step, rates in enumerate(np.stack([steady, drifts], axis=1)):
-        gatherer.add(step, rates)
-    early, late = gatherer.census
+        recorder.add(step, rates)
+    early, late = recorder.census
     np.testing.assert_array_equal(early.silent, early.last)
     whole = rate_map(walk.positions, np.float32(steady), arena_bins(walk))
     np.testing.assert_allclose(late.maps[0, 0], whole[0])
@@ -131,7 +131,7 @@ def test_a_median_is_taken_over_cells_and_averaged_over_seeds():
 
 
 def test_grid_cells_become_hexagonal_as_an_arena_is_explored(walk):
-    (early, late), errors = live_grid(
+    (early, late), errors = simulate_grid(
         walk, [0], [30.0, 240.0], BrainConfig(grid_cells=FEW), NO_NOISE
     )
     assert median(early.silent) < 0.6

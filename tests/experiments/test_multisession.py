@@ -40,8 +40,8 @@ def test_an_experiment_writes_its_rows_its_merges_and_its_figures(tour):
 def test_pose_cells_that_are_not_moved_and_turned_make_known_places_anew(cells, tour):
     """Figure 12 of the paper; its own shift alone leaves the ways turned by the new heading."""
     result = run_plan(PLANS["virtual-tour"], {"sessions": {"cells": cells}})
-    assert result.lives[-1].created_at_known > 0
-    assert result.lives[-1].brain.map.n > tour[1][0]["experiences"]
+    assert result.runs[-1].created_at_known_views > 0
+    assert result.runs[-1].brain.map.n > tour[1][0]["experiences"]
 
 
 def test_the_lab_tour_joins_where_the_rectangles_meet(tmp_path):
@@ -73,15 +73,15 @@ def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
 
 @pytest.mark.parametrize(("name", "k"), [("circuit_launch", 2), ("circuit_launch", 5)])
 def test_a_real_drive_in_sessions_has_the_shape_of_the_whole(name, k, shared):
-    from neuroslam.experiments.lives import measure
     from neuroslam.experiments.multisession import Plan, equal_parts
+    from neuroslam.experiments.session_runs import measure
 
     source = shared / "data" / name / "frames.tar"
     if not source.is_file():
         pytest.skip(f"no {name} beside the checkout")
     result = run_plan(Plan(name, str(source), equal_parts(k), preset="rc_car"))
     every = np.arange(len(result.single.trace["session"]))
-    row = measure("", result.lives, result.single, every)
+    row = measure("", result.runs, result.single, every)
     assert row["maps_not_joined"] == 0
     assert row["icp_rmse_rigid_of_diagonal"] < 0.03
     assert row["track_rmse_of_diagonal"] < 0.03
