@@ -37,7 +37,7 @@ def test_an_experiment_writes_its_rows_its_merges_and_its_figures(tour):
 
 
 @pytest.mark.parametrize("cells", ["none", "shift"])
-def test_pose_cells_that_are_not_moved_and_turned_make_known_places_anew(cells, tour):
+def test_pose_cells_that_are_not_moved_and_turned_create_experiences_twice(cells, tour):
     """Figure 12 of the paper; its own shift alone leaves the ways turned by the new heading."""
     result = run_plan(PLANS["virtual-tour"], {"sessions": {"cells": cells}})
     assert result.runs[-1].created_at_known_views > 0
@@ -72,7 +72,7 @@ def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
 
 
 @pytest.mark.parametrize(("name", "k"), [("circuit_launch", 2), ("circuit_launch", 5)])
-def test_a_real_drive_in_sessions_has_the_shape_of_the_whole(name, k, shared):
+def test_a_real_drive_in_sessions_has_the_shape_of_a_single_session(name, k, shared):
     from neuroslam.experiments.multisession import Plan, equal_parts
     from neuroslam.experiments.session_runs import measure
 

@@ -43,7 +43,7 @@ def test_results_and_figures_are_written(short):
         assert path.stat().st_size > 20_000, path.name
 
 
-def test_every_method_is_told_under_its_conditions(short):
+def test_every_method_has_rows_for_its_conditions(short):
     results, _ = short
     methods = [(row["condition"], row["method"]) for row in results["rows"]]
     assert len(methods) == len(set(methods)) == 9
@@ -52,7 +52,7 @@ def test_every_method_is_told_under_its_conditions(short):
     assert results["paper"]["mean_error_m"] == 0.031
 
 
-def test_path_integration_is_the_measure_of_all(short):
+def test_errors_are_relative_to_path_integration(short):
     for condition in (methods.FULL, methods.WEAK):
         row = row_of(short[0], condition, methods.PATH)
         assert row["ratio_to_path_integration"] == pytest.approx(1.0)
@@ -99,24 +99,24 @@ def test_checks_say_target_and_whether_it_is_met(short):
     assert (below["target"], below["met"]) == (">= 57", below["ours"] >= 57)
 
 
-def test_pose_cells_without_noise_find_the_way(data):
+def test_pose_cells_without_noise_follow_the_true_path(data):
     walk = read_track(data, "hafting", 1.0)
     path = methods.pose_cells_alone(sense(walk, NO_NOISE, [0], k=2))
-    told = walk.positions[0] + path.in_world(path.cells)[0]
-    error = np.linalg.norm(told - walk.positions[path.steps], axis=1)
+    estimate = walk.positions[0] + path.in_world(path.cells)[0]
+    error = np.linalg.norm(estimate - walk.positions[path.steps], axis=1)
     assert error.mean() < 0.01
     assert error.max() < 0.03
 
 
-def test_neighbours_in_a_batch_do_not_change_where_an_animal_is(data):
+def test_animals_of_a_batch_do_not_affect_each_other(data):
     walk = read_track(data, "triangle", 0.5)
     senses = [sense(walk, SenseNoise().scaled(s), SEEDS, k=2) for s in (1.0, 0.3)]
     both = methods.stacked(senses)
     log = methods.PlaceCellLog(np.isfinite(both.wall_m[..., 0]), walk.positions[0], 0)
     run_cells(both, experiment.BrainConfig(), log)
     alone = simulate(walk, SEEDS).estimate_m
-    told = log.estimate[:, :2].transpose(1, 0, 2) + walk.positions[0]
-    np.testing.assert_allclose(told, alone, atol=1e-6)
+    estimate = log.estimate[:, :2].transpose(1, 0, 2) + walk.positions[0]
+    np.testing.assert_allclose(estimate, alone, atol=1e-6)
 
 
 def test_fewer_place_cells_where_they_must_be_farther_apart(data, tmp_path):
