@@ -37,7 +37,7 @@ def brain_that_knows(n: int) -> NavigationBrain:
         odometry={"use": "given"},
         view={"shift_match": 5, "normalisation": 0.0},
         pose_cells={"inject_after": 0},
-        sessions={"carried": "ignore"},  # from stretch to stretch of these places the view jumps
+        sessions={"kidnapped": "ignore"},  # from stretch to stretch of these places the view jumps
     )
     brain = NavigationBrain(config)
     known = memory(places(n), config.view)

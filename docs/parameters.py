@@ -1,25 +1,27 @@
-"""Write ``docs/parameters.md`` from the configs: ``python docs/parameters.py``."""
+"""Write ``docs/parameters.md`` from the config classes: ``python docs/parameters.py``."""
 
 from pathlib import Path
+from typing import TypeGuard
 
 from pydantic import BaseModel
 
 from neuroslam.config import CLASSIC_NAMES, BrainConfig
+from neuroslam.config.populations import HOMES, section_class
 
 HEAD = """# Parameters
 
-Every parameter with its default, its bounds and what it does. Set one with
-`--set section.key=value`, several in a TOML file (`--config`), or take a preset (`--preset`); the
-config in force is written beside each result. The last column is OpenRatSLAM's name: its `.ini` and
-`.txt` files are read as they are (`--config irat.txt`).
+Set one parameter with `--set section.key=value`, several in a TOML file (`--config`), or take a
+preset (`--preset`). Every run writes its complete config beside its results. Units are part of the
+names: `_m` metres, `_s` seconds, `_rad` radians, `_deg` degrees, `_hz` 1/s, `_px` pixels.
 
-Regions are `[x_min, x_max, y_min, y_max]` in pixels. `camera_hz` is our `frame_rate_hz`;
-`image_crop_*`, `vtrans_image_*` and `vrot_image_*` are our `view.crop`, `odometry.speed_region` and
-`odometry.turn_region`.
+The last column is the name in OpenRatSLAM's `.ini` and `.txt` files, which `--config` reads too. Of
+those, `camera_hz` is `frame_rate_hz` here; `image_crop_*`, `vtrans_image_*` and `vrot_image_*` are
+`view.crop`, `odometry.speed_region` and `odometry.turn_region`, each `[x_min, x_max, y_min, y_max]`
+in pixels.
 """
 
 
-COLUMNS = "| key | default | bounds | what it does | OpenRatSLAM |\n|---|---|---|---|---|"
+COLUMNS = "| key | default | bounds | meaning | OpenRatSLAM |\n|---|---|---|---|---|"
 
 
 def bounds(metadata: list[object]) -> str:
@@ -33,13 +35,13 @@ def bounds(metadata: list[object]) -> str:
     return ", ".join(found)
 
 
-def is_section(annotation: object) -> bool:
+def is_section(annotation: object) -> TypeGuard[type[BaseModel]]:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def tables(section: type[BaseModel], path: str) -> list[str]:
-    """A table of a section's own parameters, then those of the sections within it."""
-    classic = {ours: theirs for theirs, ours in CLASSIC_NAMES.items()}
+    """Return a table of a section's own parameters, then those of the sections within it."""
+    classic = {name: theirs for theirs, name in CLASSIC_NAMES.items()}
     rows, inner = [], []
     for key, each in section.model_fields.items():
         if is_section(each.annotation):
@@ -50,12 +52,17 @@ def tables(section: type[BaseModel], path: str) -> list[str]:
             f"| `{key}` | {default} | {bounds(each.metadata)} | {each.description or ''} | "
             f"{'`' + classic[path, key] + '`' if (path, key) in classic else ''} |"
         )
-    return [f"\n## `[{path}]`\n{section.__doc__.splitlines()[0]}\n\n{COLUMNS}", *rows, *inner]
+    return [
+        f"\n## `[{path}]`\n{(section.__doc__ or '').splitlines()[0]}\n\n{COLUMNS}",
+        *rows,
+        *inner,
+    ]
 
 
 def page() -> str:
-    """The whole page."""
-    parts, general = [HEAD], []
+    """Return the text of the page."""
+    parts: list[str] = [HEAD]
+    general: list[str] = []
     for name, field in BrainConfig.model_fields.items():
         if is_section(field.annotation):
             parts += tables(field.annotation, name)
@@ -63,7 +70,10 @@ def page() -> str:
             general.append(
                 f"| `{name}` | {field.default} | {bounds(field.metadata)} | {field.description} | |"
             )
-    parts.append(f"\n## Besides\n\n{COLUMNS}")
+    for kind in HOMES:
+        if (section := section_class(kind)) is not None:
+            parts += tables(section, kind)
+    parts.append(f"\n## Outside of sections\n\n{COLUMNS}")
     return "\n".join(parts + general) + "\n"
 
 

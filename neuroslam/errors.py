@@ -1,4 +1,4 @@
-"""Errors that a user can mend: who, what was got, what was expected, what to do, in one line."""
+"""Errors that a user can fix: what was wrong, what was expected and what to do, in one line."""
 
 import difflib
 import warnings
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """End a line about an unknown name with the known one that is most like it, if any is.
+    """Return the end of a message about an unknown name: the most similar known name, if any.
 
     Example:
         >>> did_you_mean("treshold", ["threshold", "crop"]), did_you_mean("x", ["threshold"])
@@ -18,7 +18,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that is most like an unknown one, if any is like it at all.
+    """Return the known name most similar to an unknown one, or ``None`` if none is similar.
 
     Example:
         >>> nearest("treshold", ["threshold", "crop"])
@@ -28,30 +28,36 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def counted(n: int, one: str, several: str = "") -> str:
-    """Say how many, in the right number.
+    """Write a count with its noun in the singular or plural.
 
     Example:
         >>> counted(1, "frame"), counted(2, "frame"), counted(0, "loop closure")
         ('1 frame', '2 frames', '0 loop closures')
-        >>> counted(1, "place is", "places are")
-        '1 place is'
+        >>> counted(1, "experience is", "experiences are")
+        '1 experience is'
     """
     return f"{n:,} {one if n == 1 else several or one + 's'}"
 
 
+def first_line(error: Exception) -> str:
+    """Return the line of a long error that says what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[1] if len(lines) > 1 and lines[0].endswith(":") else (lines or ["?"])[0]
+
+
 class RenamedKeyWarning(FutureWarning):
-    """A config key or option that is called otherwise now; the old name is read for one release."""
+    """A config key or option was renamed; the old name is accepted for one release."""
 
 
 def with_new_names(
     values: Mapping[str, Any], renamed: Mapping[str, str], where: str
 ) -> dict[str, Any]:
-    """Return values by their present names, and warn of old ones.
+    """Replace old keys by their present names, with a warning for each.
 
     Args:
-        values: By key.
-        renamed: Old name to new one.
-        where: What the keys are of, for the warning.
+        values: Values by key.
+        renamed: Present name of each old name.
+        where: What the keys belong to, for the warning.
 
     Example:
         >>> with_new_names({"width": 3}, {"breadth": "width"}, "view")
@@ -74,23 +80,23 @@ class NeuroslamError(Exception):
 
 
 class ConfigError(NeuroslamError, ValueError):
-    """A configuration that cannot be used: unknown key, value out of bounds, unreadable file."""
+    """An unusable configuration: unknown key, value out of bounds, unreadable file."""
 
 
 class SourceError(NeuroslamError, ValueError):
-    """A video, folder, log or world that cannot be read, or a frame in it that cannot be used."""
+    """A video, folder, log or world that cannot be read, or that contains an unusable frame."""
 
 
-class BadFrame(SourceError):  # noqa: N818 - a frame is bad, the source is not
-    """One frame that cannot be used; the ones after it may be, if the policy is to skip."""
+class BadFrame(SourceError):  # noqa: N818 - the frame is bad, not the source
+    """One unusable frame; the source can be read on if the caller skips the frame."""
 
 
 class CheckpointError(NeuroslamError, ValueError):
-    """A brain file that cannot be loaded: truncated, altered, of another version, not a brain."""
+    """A brain file that cannot be loaded: truncated, altered, of another version, or no brain."""
 
 
 class MapError(NeuroslamError, ValueError):
-    """An operation that the map or the cells cannot do: an id out of range, activity that died."""
+    """An operation that the map or the cells cannot do: an id out of range, silent activity."""
 
 
 class RunError(NeuroslamError, ValueError):
@@ -104,14 +110,14 @@ class SpaceError(NeuroslamError, ValueError):
 _SHOWN = 5
 
 
-def listed(values: Iterable[float]) -> str:
-    """Write the first five of many values, and how many more there are.
+def listed(values: Iterable[object]) -> str:
+    """Write the first five values, and how many more there are.
 
     Example:
         >>> listed(range(7))
         '0, 1, 2, 3, 4 and 2 more'
     """
-    rows = [value.item() if hasattr(value, "item") else value for value in values]
+    rows = [getattr(value, "item", lambda value=value: value)() for value in values]
     shown = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in rows[:_SHOWN])
     more = len(rows) - _SHOWN
     return f"{shown} and {more} more" if more > 0 else shown

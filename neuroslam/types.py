@@ -1,18 +1,18 @@
-"""The nouns that flow between the stages. SI units; x forward, y left, angles counter-clockwise."""
+"""Types that flow between the stages. SI units; x forward, y left, angles counter-clockwise."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 NO_TEMPLATE = -1
-"""Template id of a frame that shows nothing to recognise (no image, or no contrast in it)."""
+"""Template id of a frame that cannot be matched: without an image, or without contrast in it."""
 
 NO_EXPERIENCE = -1
 """Experience id before the first experience exists."""
 
 
 class Pose(NamedTuple):
-    """A place and a heading in the plane: metres, metres, radians."""
+    """Position and heading in the plane: metres, metres, radians."""
 
     x_m: float
     y_m: float
@@ -20,14 +20,14 @@ class Pose(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """Forward speed (m/s, backward negative) and turn rate (rad/s, to the left positive)."""
+    """Forward speed (m/s, negative backward) and turn rate (rad/s, positive to the left)."""
 
     v_m_s: float
     w_rad_s: float
 
 
 class Motion(NamedTuple):
-    """Self-motion since the previous frame: speed, turn rate, and for how many seconds."""
+    """Self-motion since the previous frame: speed, turn rate, and duration in seconds."""
 
     v_m_s: float
     w_rad_s: float
@@ -35,24 +35,24 @@ class Motion(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What a source delivers at one instant; ``None`` where it does not have it.
+    """The sensor data of one instant; ``None`` for a sensor that has no sample.
 
     Attributes:
         index: Number of the frame in its source, from 0.
-        time_s: Time of the frame in seconds; rises strictly from frame to frame.
+        time_s: Time of the frame in seconds; strictly increasing from frame to frame.
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
         velocity: Measured self-motion over the interval that ends at this frame.
         ranges: Distances in metres, ``(n,)``, at bearings evenly over the full turn,
-            counter-clockwise from straight ahead; ``inf`` where nothing is in reach.
+            counter-clockwise from straight ahead; ``inf`` where nothing is in range.
         walls: Distance (m) and bearing (rad, relative to the heading) of the foot of the
-            perpendicular on each wall seen, ``(n, 2)``.
-        heading_rad: Heading measured by a compass, in the world.
-        landmarks: Landmarks in sight, ``(n, 3)``: number (-1 where it has no name), distance in
+            perpendicular on each visible wall, ``(n, 2)``.
+        heading_rad: Heading in the world, measured by a compass.
+        landmarks: Visible landmarks, ``(n, 3)``: number (-1 for one without a name), distance in
             metres, bearing in radians relative to the heading.
-        truth: True pose, where the source knows it. Never used by the brain, only by evaluation.
+        truth: Ground-truth pose, if known. Used by evaluation, never by the brain.
     """
 
-    index: int
+    index: int  # type: ignore[assignment] # hides tuple.index, which nothing calls
     time_s: float
     image: np.ndarray | None = None
     velocity: Velocity | None = None
@@ -64,16 +64,17 @@ class Frame(NamedTuple):
 
 
 class ViewMatch(NamedTuple):
-    """Which stored view a frame shows.
+    """Result of comparing a frame's view with the stored templates.
 
     Attributes:
-        template: Id of the template, or ``NO_TEMPLATE`` if the frame shows nothing to recognise.
-        error: Smallest mean absolute difference to a stored template (grey levels in [0, 1]);
-            -1 where there was nothing to compare with. Of a new view among thousands it is that of
-            a near template, above the threshold, not surely the nearest.
-        relative_heading_rad: Heading now minus heading when the template was learnt (panoramic
-            views), in (-pi, pi]; 0 for forward views.
-        is_new: The template was created from this very frame.
+        template: Id of the matching template, or ``NO_TEMPLATE`` if the frame cannot be matched.
+        error: Match error: smallest mean absolute difference to a template (grey in [0, 1]); -1
+            without a template to compare with. For a new view among thousands of templates the
+            search may stop early: the error is then above the threshold, but not always the
+            smallest.
+        relative_heading_rad: Present heading minus heading at which the template was learnt
+            (panoramic views), in (-pi, pi]; 0 for forward views.
+        is_new: Whether the template was created from this frame.
     """
 
     template: int
@@ -83,7 +84,7 @@ class ViewMatch(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """Centre of the dominant activity packet, in cells, each from 0 to the size of its axis."""
+    """Centre of the dominant activity packet in cells; each coordinate in [0, size of its axis)."""
 
     x: float
     y: float
@@ -91,7 +92,7 @@ class PoseEstimate(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """What the brain says after one frame; but for ``lost``, the columns of ``frames.csv``."""
+    """Output of the brain after one frame: the columns of ``frames.csv``, and ``lost``."""
 
     frame: int
     time_s: float

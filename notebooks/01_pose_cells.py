@@ -12,10 +12,10 @@
 
 # %% [markdown]
 # # Pose cells: a belief that moves
-# RatSLAM keeps its estimate of *where am I, and which way do I face* as a packet of activity in a
-# three-dimensional sheet of cells: x, y and heading. Every axis goes round, so the sheet is a torus
-# and a small one serves a large world. This notebook looks at the cells alone: how a packet forms,
-# how it follows odometry, and how a familiar view moves it.
+# RatSLAM represents its pose estimate as a packet of activity in a three-dimensional sheet of cells:
+# x, y and heading. Every axis is periodic, so the sheet is a torus and a small one serves a large
+# world. This notebook shows the cells alone: how a packet forms, how it follows odometry, and how a
+# known view moves it.
 #
 # Equations are those of Menezes et al., *A Multisession SLAM Approach for RatSLAM* (2023).
 
@@ -67,14 +67,14 @@ def known(template):
 
 # %% [markdown]
 # ## Neighbours excite, the surround inhibits
-# Each step spreads activity with a narrow Gaussian $W_e$, takes away what a wide one $W_i$ collects,
+# Each step spreads activity with a narrow Gaussian $W_e$, subtracts the result of a wide one $W_i$,
 # removes a constant $\varphi$ from every cell, and normalises (Eqs. 1 and 3):
 #
 # $$P \leftarrow W_e * P, \qquad P \leftarrow P - W_i * P, \qquad
 # P \leftarrow [P - \varphi]_+ / \textstyle\sum [P - \varphi]_+$$
 #
 # **What to see:** together they are a Mexican hat: a cell and its neighbours gain (red), the ring
-# around them loses (blue). The pictures are sums over heading; the last one has colours of its own.
+# around them loses (blue). The images are sums over heading; the last one has its own colour scale.
 
 # %%
 excite, inhibit = (kernels[2].numpy() for kernels in network().kernels)
@@ -103,7 +103,7 @@ plt.show()
 # %% [markdown]
 # ## A packet forms
 # **What to see:** all activity begins in one cell; three steps later it is a compact packet of a
-# hundred cells that keeps its size. A belief that was too wide shrinks to the very same packet
+# hundred cells that keeps its size. A packet that is too wide shrinks to the same packet
 # (right). That is the attractor.
 
 # %%
@@ -136,10 +136,10 @@ plt.show()
 
 # %% [markdown]
 # ## It follows odometry
-# Layer $k$ holds the belief of heading $\theta_k$, so it moves by $v\,dt$ along $\theta_k$; then all
+# Layer $k$ holds the activity of heading $\theta_k$, so it moves by $v\,dt$ along $\theta_k$; then all
 # layers turn by $\omega\,dt$. Here the robot drives three circles.
 #
-# **What to see:** the estimate (dots) lies on the circle that odometry says (line), lap after lap,
+# **What to see:** the estimate (dots) follows the circle of the odometry (line), lap after lap,
 # and where the circle leaves the sheet it comes in again on the other side.
 
 # %%
@@ -163,7 +163,7 @@ axes[1].plot(np.hypot(*error.T), color=MAP)
 for lap in (80, 160):
     axes[1].axvline(lap, color="#777777", lw=0.8, ls=":")
 axes[1].set(xlabel="step (80 a lap)", ylabel="distance (cells)", ylim=(0, 0.1))
-axes[1].set_title("How far the estimate is from odometry")
+axes[1].set_title("Distance of the estimate from odometry")
 plt.show()
 print(f"after three laps the estimate is {np.hypot(*error[-1]):.2f} cells from odometry")
 
@@ -176,9 +176,9 @@ plot_pose_cells(cells.activity.numpy(), cells.estimate)
 
 # %% [markdown]
 # ## It turns
-# On the spot nothing moves but the heading, along an axis that goes round every 36 cells.
+# A turn on the spot changes only the heading, along an axis with a period of 36 cells.
 #
-# **What to see:** the packet (bright) stays on the heading asked for (dashes) through two full turns.
+# **What to see:** the packet (bright) follows the commanded heading (dashes) through two full turns.
 
 # %%
 cells = network()
@@ -193,7 +193,7 @@ figure, axes = plt.subplots(figsize=(8, 3.2))
 drawn = axes.imshow(
     np.array(strip).T, ACTIVITY, origin="lower", aspect="auto", extent=(-0.5, 143.5, -5, 355)
 )
-axes.plot(asked, "--", color="white", lw=1.2, label="asked")
+axes.plot(asked, "--", color="white", lw=1.2, label="commanded")
 axes.grid(visible=False)
 axes.set(xlabel="step", ylabel="heading θ (°)", yticks=range(0, 360, 90), ylim=(-5, 355))
 axes.set_title("Two turns on the spot, 5° a step")
@@ -207,8 +207,8 @@ plt.show()
 # it is slow; the lag depends on cell size and frame rate, and is why old parameter sets do not carry
 # over. Here the slip is measured and fed back (`exact_gain`), so a metre is a metre at any speed.
 #
-# **What to see:** driven at 0.1 cells a step the classic network makes 88 % of its way, and turned as
-# slowly it loses about as much; with exact gain it makes all of it.
+# **What to see:** driven at 0.1 cells a step the classic network covers 88 % of the path, and loses about
+# as much in a slow turn; with exact gain it covers all of it.
 
 # %%
 speeds = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0])
@@ -238,7 +238,7 @@ for panel, title, axis in zip(axes, ("Driving", "Turning"), ("speed", "turn rate
     panel.set(xscale="log", title=title, xlabel=f"{axis} (cells a step)")
     panel.set_xticks(speeds, [f"{s:g}" for s in speeds])
     panel.minorticks_off()
-axes[0].set_ylabel("made / asked")
+axes[0].set_ylabel("gain: measured / commanded")
 axes[0].legend(loc="lower right")
 plt.show()
 
@@ -247,19 +247,19 @@ plt.show()
 # A view is bound to the estimate at which it was first seen. Seen again, it injects activity there
 # (Eq. 5). A second packet grows beside the first; they inhibit each other, and one wins.
 #
-# **What to see:** the packet is at x = 4, and views are seen that were learnt around x = 14. After
-# one glance (left) the second packet lives on for a hundred steps, and loses. After five views that
+# **What to see:** the packet is at x = 4, and the views seen were learnt around x = 14. After
+# one view (left) the second packet lives on for a hundred steps, and loses. After five views that
 # belong together (right) the estimate has jumped to it (dashes), and the first packet loses.
 
 # %%
 figure, axes = plt.subplots(
     2, 2, figsize=(11, 5.2), sharex=True, sharey="row", height_ratios=[2, 1.2]
 )
-for column, glances, title in zip(axes.T, (1, 5), ("One glance", "Five views"), strict=True):
+for column, glances, title in zip(axes.T, (1, 5), ("One view", "Five views"), strict=True):
     cells = network(inject_after=0)
     for template in range(5):  # learnt along a line from x = 13.4 to x = 14.6
         place(cells, 13.4 + 0.3 * template, 10.0, 0.0)
-        cells.see(new(template))
+        cells.update_from_view(new(template))
     place(cells, 4.0, 10.0, 0.0)
     strip, found = [], []
     for step in range(160):
@@ -284,11 +284,11 @@ figure.colorbar(drawn, ax=axes[0], label="share of all activity", pad=0.01)
 plt.show()
 
 # %% [markdown]
-# ## A view tires
-# A robot that stands still sees one view again and again. Were it to inject for ever, a wrong match
-# would drag the belief away. So a view that is seen in a row tires: it injects
+# ## Fatigue of a view
+# A robot that stands still sees one view again and again. Without fatigue, a wrong match would displace the
+# estimate. So a view that is seen repeatedly injects
 # $\delta\,(30 - e^{1.2\,d})/30$, and its decay $d$ grows each time and recovers slowly. The activity
-# in the network sums to 1, so what a view adds is what there is more of.
+# of the network sums to 1 before the injection, so the excess is the injected activity.
 #
 # **What to see:** after two frames in a row the view is silent; seventy steps later it injects again.
 
@@ -299,7 +299,7 @@ cells(STILL, UNSEEN)
 added = []
 for step in range(80):
     shown = step < 5 or step >= 75
-    cells.see(known(0) if shown else UNSEEN)
+    cells.update_from_view(known(0) if shown else UNSEEN)
     added.append(cells.packet.values.sum().item() - 1.0 if shown else np.nan)
     cells.integrate(STILL)
 figure, axes = plt.subplots(figsize=(8, 2.8))
@@ -312,8 +312,8 @@ plt.show()
 
 # %% [markdown]
 # ## Too much inhibition
-# Where global inhibition is above all activity nothing is left to normalise. That is an error with a
-# name, never a NaN.
+# If global inhibition exceeds all activity, nothing is left to normalise. That is a named error, never a
+# NaN.
 
 # %%
 try:

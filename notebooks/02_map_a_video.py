@@ -13,8 +13,8 @@
 # %% [markdown]
 # # From a video to a map
 # A robot drives two laps of an office corridor. Its odometry drifts; its camera sees doors, posters
-# and plants. RatSLAM makes one map of both. The corridor is rendered here, so the truth is known and
-# nothing has to be downloaded; your own video goes the same way (last cell).
+# and plants. RatSLAM combines both in one map. The corridor is rendered here, so the ground truth is known
+# and nothing has to be downloaded; the last cell maps your own video.
 
 # %%
 # %matplotlib inline
@@ -55,13 +55,11 @@ lap = source.frames_per_lap
 print(f"{len(frames)} frames of {frames[0].image.shape}, {frames[-1].time_s:.0f} s, {lap} a lap")
 
 same = sum(np.array_equal(frames[i].image, frames[i + lap].image) for i in range(len(frames) - lap))
-print(
-    f"{same} of the {len(frames) - lap} pictures of the second lap are those of the first, exactly"
-)
+print(f"{same} of the {len(frames) - lap} images of the second lap are equal to those of the first")
 
 # %% [markdown]
-# Only odometry is noisy here. The second lap shows the pictures of the first again, to the pixel:
-# nothing is easier to recognise. A drive with changing light and passers-by follows further down.
+# Only odometry is noisy here. The second lap shows the images of the first again, pixel by pixel: the
+# easiest case of view matching. A drive with changing light and passers-by follows below.
 #
 # **What to see:** on the left the first lap; on the right the same places, a lap later.
 
@@ -71,9 +69,9 @@ contact_sheet([frames[i].image for i in shown], [f"frame {i}" for i in shown])
 
 # %% [markdown]
 # ## Frame by frame
-# `brain(frame)` is the whole of it: odometry, view cells, pose cells, map. Each result says what was
-# recognised and what was done about it: `none`, `create` a place, or `link` back to a known one. What
-# is drawn below is noted on the way.
+# `brain(frame)` does everything: odometry, view cells, pose cells, map. Each result holds the view match
+# and the action on the map: `none`, `create` an experience, or `link` to a known one. The loop also
+# stores what is drawn below.
 
 # %%
 brain = NavigationBrain(BrainConfig())
@@ -84,13 +82,13 @@ for frame in frames[:400]:
     corrections.append(brain.map.largest_correction)
     maps.append((brain.map.poses, brain.map.links, brain.map.pose))
 closed = next(r.frame for r in results if r.action == "link")
-print(f"frame {closed}: back at place {results[closed].experience}")
-print(f"{brain.view.n} views, {brain.map.n} places, {brain.map.n_links} links")
+print(f"frame {closed}: loop closed at experience {results[closed].experience}")
+print(f"{brain.view.n} templates, {brain.map.n} experiences, {brain.map.n_links} links")
 results[closed]
 
 # %% [markdown]
-# A view is 600 bytes: grey, shrunk, normalised. **What to see:** the frame, and the template of the
-# first lap that it was recognised as.
+# A template is 600 bytes: grey, downsampled, normalised. **What to see:** the frame, and the matching
+# template of the first lap.
 
 # %%
 last = results[-1]
@@ -104,7 +102,7 @@ plot_frame_and_template(
 # %% [markdown]
 # How different are views? **What to see:** every tenth frame of both laps against every other: dark
 # along the diagonal is a frame and itself; the dark line a lap away is the corridor seen again.
-# Both are exactly 0, as the pictures are the same.
+# Both are exactly 0, as the images are equal.
 
 # %%
 every = range(0, len(frames), 10)
@@ -118,21 +116,21 @@ axes.annotate(
     arrowprops={"arrowstyle": "->", "color": "white", "lw": 2},
 )  # fmt: skip
 axes.grid(visible=False)
-axes.set(xlabel="frame", ylabel="frame", title="Difference of views")
+axes.set(xlabel="frame", ylabel="frame", title="Match error between views")
 figure.colorbar(drawn, label="mean absolute difference (grey, 0 to 1)", extend="max")
 plt.show()
 
 # %% [markdown]
-# **What to see:** activity in the pose cells is one compact packet: the robot is sure where it is.
+# **What to see:** the activity of the pose cells is one compact packet: the pose estimate is unambiguous.
 
 # %%
 plot_pose_cells(brain.pose_cells.activity.numpy(), brain.pose_cells.estimate)
 
 # %% [markdown]
 # ## The map grows
-# **What to see:** after 150 frames half a rectangle; just before the lap is complete, odometry's
-# error leaves it open; at frame 399 it is closed, and the second lap runs on the places of the first,
-# where odometry alone (grey) drives beside them.
+# **What to see:** after 150 frames half a rectangle; just before the lap is complete, the
+# error of odometry leaves it open; at frame 399 it is closed, and the second lap follows the experiences
+# of the first, while odometry alone (grey) drifts away from them.
 
 # %%
 odometry = integrate_velocities(
@@ -152,7 +150,7 @@ for panel, index in zip(panels, (150, closed - 1, 399), strict=True):
     draw_links(panel, poses, links, color=MAP, lw=2)
     panel.plot(*pose[:2], "o", ms=9, color=ROBOT, mec=INK)
     panel.set(xlabel="x (m)", aspect="equal")
-    write_title(panel, f"Frame {index}", f"{len(poses)} places")
+    write_title(panel, f"Frame {index}", f"{len(poses)} experiences")
 panels[0].set_ylabel("y (m)")
 handles = (
     panels[1].plot([], [], color=colour, label=name, **style)[0]
@@ -167,11 +165,11 @@ plt.show()
 
 # %% [markdown]
 # ## A loop closes, the map relaxes
-# The new link says *these two places are next to each other*; the map says they are not. Relaxation
-# shares the disagreement out over all links, twenty loops a frame, until nothing moves any more.
+# The new link states that two experiences are next to each other; on the map they are not. Relaxation
+# distributes the residual over all links, twenty loops per frame, until the map is at rest.
 #
 # **What to see:** left, the link (orange) spans a gap; sixty frames later the gap is gone, and every
-# place has moved a little from where it was (grey). Right, the corrections die away.
+# experience has moved a little from its old position (grey). Right, the corrections decay.
 
 # %%
 before, after = maps[closed - 1][0], maps[-1][0]
@@ -182,7 +180,7 @@ for panel, poses, title in zip(
 ):
     draw_links(panel, before, maps[closed - 1][1], color=ODOMETRY, lw=1)
     panel.plot([], color=ODOMETRY, lw=1, label=f"frame {closed - 1}")
-    panel.plot(*poses[:, :2].T, ".", ms=4, color=MAP, label="places")
+    panel.plot(*poses[:, :2].T, ".", ms=4, color=MAP, label="experiences")
     panel.plot(*poses[ends, :2].T, "o-", ms=5, lw=2.5, color=LOOP, label="the new link")
     panel.set(xlabel="x (m)", aspect="equal", xlim=(-8, 3), ylim=(-7, 7))
     spans = np.hypot(*np.diff(poses[ends, :2], axis=0)[0])
@@ -191,12 +189,12 @@ panels[1].legend(loc="center")
 panels[0].set_ylabel("y (m)")
 panels[2].semilogy(range(closed, 400), corrections[closed:], ".-", color=MAP)
 panels[2].set(xlabel="frame", ylabel="largest correction (m or rad)", box_aspect=14 / 11)
-panels[2].set_title("On the way to rest")
+panels[2].set_title("Largest correction until rest")
 plt.show()
 
 # %% [markdown]
-# ## Save, load, go on
-# One file holds all of the brain. The loaded one goes on bit for bit as if it had never stopped.
+# ## Save, load, continue
+# One file holds the whole brain. The loaded brain continues bit for bit like one that never stopped.
 
 # %%
 with tempfile.TemporaryDirectory() as folder:
@@ -210,7 +208,7 @@ offsets.append(brain.map.offset)
 for frame in frames[401:]:
     results.append(brain(frame))
     offsets.append(brain.map.offset)
-print(f"{brain.view.n} views, {brain.map.n} places: the second lap was known")
+print(f"{brain.view.n} templates, {brain.map.n} experiences: the second lap was known")
 
 # %% [markdown]
 # **What to see:** new views (orange) come in the first lap only; then memory stays as it is.
@@ -227,8 +225,8 @@ plot_signals(table, brain.config.view.threshold)
 
 # %% [markdown]
 # ## How good is it?
-# Every frame keeps its offset from its place, so the track moves with the map. The absolute
-# trajectory error (ATE) is what is left after the track has been laid over the truth.
+# Every frame keeps its offset from its experience, so the trajectory moves with the map. The absolute
+# trajectory error (ATE) is the RMSE after the trajectory was aligned with the truth.
 #
 # **What to see:** left, odometry alone; right, the map on the truth (dashed), between the walls.
 
@@ -256,14 +254,14 @@ plot_map(
 )
 
 # %% [markdown]
-# Without scaling (rigid) the map is farther off: how long a metre is comes from odometry, and no loop
-# can tell. The figure scales truth and walls, and says by how much.
+# Without scaling (rigid) the error is larger: the scale comes from odometry, and loop closures cannot
+# correct it. The figure scales truth and walls, and states the factor.
 #
 # ## A harder drive
 # The same two laps, but the light changes and four people walk about.
 #
-# **What to see:** people hide what was learnt, so there are more places, and the map bends a little
-# more; it still closes. This is one drive, not a benchmark.
+# **What to see:** people occlude known views, so there are more experiences, and the map bends a little
+# more; its loops still close. This is one drive, not a benchmark.
 
 # %%
 harder = open_source("world:corridor?laps=2&noise=0.05&light=0.3&people=4")
@@ -273,7 +271,7 @@ for frame in harder.frames():
 again = np.array([other.place(r.experience, at) for r, at in steps])
 error = absolute_trajectory_error(again[:, :2], truth[:, :2], "rigid").rmse
 late = sum(r.view.is_new for r, _ in steps[lap + 1 :])
-print(f"{other.view.n} views ({late} of them new in the second lap), {other.map.n} places")
+print(f"{other.view.n} templates ({late} of them new in the second lap), {other.map.n} experiences")
 print(f"rigid: odometry {odometry_error:.2f} m, map {error:.2f} m (ATE, RMSE)")
 links = other.map.links
 plot_map(
@@ -287,22 +285,23 @@ plot_map(
 
 # %% [markdown]
 # ## Use the map
-# Links know how long they took, so the quickest way anywhere is a shortest path. **What to see:** the
-# way (orange) from the robot to a place a third of the lap away.
+# Links store durations, so the fastest path to an experience is a shortest path in the graph.
+#
+# **What to see:** the path (orange) from the robot to an experience a third of the lap away.
 
 # %%
 goal = brain.map.n // 3
 plan = brain.map.plan(goal)
 distance, bearing = brain.map.distance_and_bearing(goal)
-print(f"place {goal} is {distance:.1f} m away, at {np.degrees(bearing):.0f}° to the left")
+print(f"experience {goal} is {distance:.1f} m away, at {np.degrees(bearing):.0f}° to the left")
 xy = brain.map.poses[:, :2]
 figure, axes = plt.subplots(figsize=(5.2, 6.4))
-axes.plot(*xy.T, ".", color=MAP, label="places")
-axes.plot(*xy[plan.path].T, color=LOOP, lw=4, alpha=0.7, label="quickest way")
+axes.plot(*xy.T, ".", color=MAP, label="experiences")
+axes.plot(*xy[plan.path].T, color=LOOP, lw=4, alpha=0.7, label="fastest path")
 axes.plot(*xy[goal], "*", ms=15, ls="none", color=ROBOT, mec=INK, label="goal")
 axes.plot(*brain.map.pose[:2], "o", ms=9, ls="none", color="white", mec=INK, label="robot")
 axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-write_title(axes, f"To place {goal}", f"{len(plan.path)} places, {plan.duration_s:.0f} s")
+write_title(axes, f"To experience {goal}", f"{len(plan.path)} experiences, {plan.duration_s:.0f} s")
 legend_below(axes, columns=4)
 plt.show()
 
@@ -313,5 +312,5 @@ plt.show()
 # summary = run("drive.mp4", "out")            # map.png, CSVs, the brain, TensorBoard events
 # print(summary.counts)
 # ```
-# or `neuroslam run drive.mp4 -o out`. If too many or too few places are recognised, move
+# or `neuroslam run drive.mp4 -o out`. If too many or too few views match, change
 # `view.threshold`; [docs/parameters.md](../docs/parameters.md) has them all.

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Cells of a rat
 # An animal knows how fast it runs, where it heads, and how far the walls around are. It has no camera.
-# Boundary cells, grid cells and place cells make a map of that. The arena and the animal are made here,
-# so the truth is known and nothing has to be downloaded; a recording goes the same way (last cell).
+# Boundary cells, grid cells and place cells make a map from these. The arena and the animal are made here,
+# so the truth is known and nothing has to be downloaded; the last cell reads a recording.
 
 # %%
 # %matplotlib inline
@@ -91,9 +91,9 @@ figure.legend(loc="outside lower center", ncols=4)
 plt.show()
 
 # %% [markdown]
-# ## A life
-# `NavigationCells` composes everything. Four animals live through one walk at once, each with its own
-# noise: speeds wrong by 10 %, compasses by 3°, at every sample.
+# ## A walk
+# `NavigationCells` composes everything. Four animals take one walk as a batch, each with its own noise: 10 %
+# in speed and 3° in the compass, at every sample.
 
 # %%
 rates, boundary = [], []
@@ -125,9 +125,9 @@ plot_firing_maps([firing], "Where three boundary cells fire", "mean rate")
 # %% [markdown]
 # ## Grid cells
 # Six oscillators a module turn by $\mathbf k_j\cdot\Delta x$. A lateral anti-Hebbian network learns from
-# their phases at random places, before the first step; no one shows it a hexagon.
+# their phases at random positions, before the first step, without hexagons in its input.
 #
-# **What to see:** firing maps of one cell from each module, and their autocorrelograms: six peaks around
+# **What to see:** rate maps of one cell from each module, and their autocorrelograms: six peaks around
 # the middle, farther apart from left to right. Scores near 1.3 are clean hexagons.
 
 # %%
@@ -170,7 +170,7 @@ print("d rates / d Q:", tuple(grid.feedforward.grad.shape))
 # a map to plan on.
 #
 # **What to see:** place cells of the first animal and their links fill the arena; squares are the feet of
-# remembered walls and lie on its outline; the orange way was planned from corner to corner.
+# remembered walls and lie on its outline; the orange path was planned from corner to corner.
 
 # %%
 brain = NavigationBrain(build_config(read_preset("slrb")))
@@ -180,7 +180,7 @@ start = np.array(next(iter(open_source("arena:pentagon?minutes=8&speed=0.15&seed
 centres, links = (part.numpy() for part in brain.navigation.place.graph())
 centres = centres + start
 goal, here = int(centres[:, 1].argmax()), int(centres[:, 0].argmin())
-way = brain.map.plan(goal, start=here).path
+path = brain.map.plan(goal, start=here).path
 wall = brain.navigation.walls.remembered()[0]
 feet = np.column_stack([wall.x_m + wall.distance_m * wall.bearing_rad.cos(),
                         wall.y_m + wall.distance_m * wall.bearing_rad.sin()]) + start  # fmt: skip
@@ -188,16 +188,16 @@ figure, axes = plt.subplots(figsize=(5.4, 5.6), layout="constrained")
 axes.plot(*centres[links].transpose(2, 1, 0), color=MAP, lw=0.6, alpha=0.6)
 axes.plot(*centres.T, ".", color=MAP, ms=4, label=f"{len(centres)} place cells")
 axes.plot(*feet.T, "s", color=LOOP, ms=4, label=f"{len(feet)} stretches of wall")
-axes.plot(*centres[way].T, color=ROBOT, lw=3, label="planned way")
+axes.plot(*centres[path].T, color=ROBOT, lw=3, label="planned path")
 draw_arena(axes, arena)
-axes.set_title("Places, links, walls, and a way")
+axes.set_title("Place cells, links, walls, and a planned path")
 figure.legend(loc="outside lower center", ncols=3)
 plt.show()
 
 # %% [markdown]
 # ## Drift, and walls that correct it
-# A wall tells where the animal is perpendicular to it, and nothing along it. Met again, it corrects the phases
-# of all modules by one displacement.
+# A wall measures the position perpendicular to it, and nothing along it. Met again, it corrects the phases of
+# all modules by one displacement.
 #
 # **What to see:** without walls the error grows; with them it stays near 2 to 4 cm from the first minutes on.
 # Bands are the least and the largest of four animals.
@@ -212,18 +212,18 @@ for name, track, colour in (
     off = 100 * np.linalg.norm(track - walk.positions, axis=-1)
     axes.fill_between(minutes, off.min(0), off.max(0), color=colour, alpha=0.2, lw=0)
     axes.plot(minutes, off.mean(0), color=colour, label=name)
-axes.set(xlabel="time (min)", ylabel="error of position (cm)", ylim=(0, None), xlim=(0, 8))
+axes.set(xlabel="time (min)", ylabel="position error (cm)", ylim=(0, None), xlim=(0, 8))
 axes.set_title("Error over time, four animals")
 axes.legend(loc="upper left")
 plt.show()
 
 # %% [markdown]
-# ## Carried away
-# After six minutes the animal is lifted and put down elsewhere. It cannot see; but walls are where none should
-# be, or are missing.
+# ## A kidnapped animal
+# After six minutes the animal is moved to another position. It has no camera; but it meets walls where the map
+# has none, or misses walls of the map.
 #
-# **What to see:** doubt is 0 until the animal is carried (dashed), and grows when it meets walls then. Beyond
-# 4 s it says that it is lost, and learns nothing more.
+# **What to see:** doubt, the time for which walls disagree with the map, is 0 until the animal is kidnapped
+# (dashed), and grows when it meets walls then. Beyond 4 s the animal is lost, and learns nothing more.
 
 # %%
 frames = list(open_source("arena:triangle?minutes=9&noise=1&seed=1&speed=0.15"))
@@ -238,24 +238,24 @@ axes.plot(np.arange(len(doubt)) / 1200, doubt, color=LOOP)
 axes.axvline(lift / 1200, color=INK, ls="--", lw=1)
 axes.axhline(brain.config.wall_memory.lost_after_s, color=INK, lw=0.6)
 axes.set(xlabel="time (min)", ylabel="doubt (s)")
-axes.set_title("Carried at 6 min: " + ("it says that it is lost" if result.lost else "not noticed"))
+axes.set_title("Kidnapped at 6 min: " + ("lost" if result.lost else "not detected"))
 plt.show()
 
 # %% [markdown]
-# A camera helps: with the preset `ratslam_slrb` views remember where they were learnt, and the robot goes there
-# (`docs/navigation_cells.md`).
+# A camera helps: with the preset `ratslam_slrb` templates store the position where they were learnt, and a view
+# match relocalises the robot (`docs/navigation_cells.md`).
 #
-# ## Two lives, one map
-# Two animals in one arena, started at other places with other noise. Their maps meet by their walls.
+# ## Two sessions, one map
+# Two animals in one arena, with other starts and other noise. Their maps are aligned by their walls.
 #
-# **What to see:** the report says how many stretches of wall lie on each other; the joined map is one pentagon of
-# places, and not two shifted ones.
+# **What to see:** the report counts the matched stretches of wall; the merged map is one pentagon of place
+# cells, not two shifted ones.
 
 # %%
 brains = []
 for seed in (1, 2):
     one = NavigationBrain(build_config(read_preset("slrb")))
-    one.about = (f"life {seed}", "slrb", "")
+    one.about = (f"session {seed}", "slrb", "")
     for frame in open_source(f"arena:pentagon?minutes=6&noise=1&seed={seed}&speed=0.15"):
         one(frame)
     brains.append(one)
@@ -266,7 +266,7 @@ plot_map(merged.map.poses, np.column_stack([links.source, links.target]))
 
 # %% [markdown]
 # ## Your own animal
-# An `.npz` with `t`, `pos` and `arena_radius` or `vertices` opens like an arena:
+# An `.npz` with `t`, `pos` and `arena_radius` or `vertices` is a source like an arena:
 # `neuroslam run rat.npz -o out --preset slrb`, or in Python
 # `read_walk("rat.npz").lasting(30)` in place of `roam(...)` above. Many animals at once:
 

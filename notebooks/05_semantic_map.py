@@ -12,9 +12,9 @@
 
 # %% [markdown]
 # # A semantic map
-# An animal walks among landmarks that are something: a blue square, an orange triangle, a wall. Its
-# position is a vector whose waves its velocity turns; what it sees is bound to that vector and learnt.
-# Afterwards the map can be asked: where are the blue things, what is in this area, how far is it?
+# An animal walks among landmarks with attributes: a blue square, an orange triangle, a wall. Its position
+# is a vector whose phases rotate with its velocity; each landmark in sight is bound to that vector and
+# learnt. Afterwards the map answers queries: where are the blue objects, what is in this area, how far is it?
 # (SSP-SLAM; Dumont, Furlong, Orchard and Eliasmith 2023.)
 
 # %%
@@ -39,8 +39,8 @@ plt.rcParams.update(STYLE)
 
 # %% [markdown]
 # ## Positions as vectors
-# Binding two vectors adds their positions, so a map can be moved without being read. A vector is like
-# those of places nearby, with ripples: that is the width at which places are told apart.
+# Binding two vectors adds their positions, so a map can be moved without being decoded. The similarity of two
+# vectors falls with distance, with ripples; its width is the spatial resolution.
 #
 # **What to see:** one peak, half as high 0.14 m away, and ripples below 0.2.
 
@@ -56,12 +56,14 @@ across = torch.stack([offset, torch.zeros_like(offset)], dim=-1)
 figure, axes = plt.subplots(figsize=(6.5, 2.8), layout="constrained")
 axes.plot(offset, space.kernel(across), color=MAP)
 axes.axhline(0, color=INK, lw=0.6)
-axes.set(xlabel="distance (m)", ylabel="similarity", title="How alike two places are", xlim=(-1, 1))
+axes.set(
+    xlabel="distance (m)", ylabel="similarity", title="Similarity of two positions", xlim=(-1, 1)
+)
 plt.show()
 
 # %% [markdown]
 # ## A world, a walk, a map
-# The tier `algebraic` has vectors alone; `rate` and `spiking` have the same parts in neurons.
+# The tier `algebraic` uses vectors only; `rate` and `spiking` implement the same parts with neurons.
 
 # %%
 world = paper_world()
@@ -77,8 +79,8 @@ life = simulate(slam, [world], [path])
 print(f"error {1000 * life.ate_m[0]:.2f} mm; seen for", life.seen_s[0].round(1).tolist(), "s")
 
 # %% [markdown]
-# ## Questions
-# Sums of pointers recall sums of places; a wall is a region.
+# ## Queries
+# Sums of pointers recall sums of positions; a wall is a region.
 #
 # **What to see:** the peaks lie in the rings, and the wall is warm along its whole length.
 
@@ -96,7 +98,7 @@ answers = [
 plot_queries(world, path.position_m, answers, "What the map answers")
 
 # %% [markdown]
-# A second memory goes the other way, from places to pointers; the box's own vector is its key.
+# A second memory maps positions to pointers; the vector of an area is its key.
 #
 # **What to see:** the square and the orange triangle are in the area, the blue triangle is not.
 
@@ -105,9 +107,9 @@ low, high = np.array([-0.45, -0.45]), np.array([0.9, 0.5])
 plot_area(world, low, high, queries.what(slam, low, high), "What is in the area?")
 
 # %% [markdown]
-# All of the map fits into one vector, the sum of each pointer bound to its place.
+# One vector can hold the whole map: the sum of all pointers, each bound to its position.
 #
-# **What to see:** unbound by a pointer, the same vector is where that landmark is, with some noise.
+# **What to see:** unbound by a pointer, the vector is similar to the position of that landmark, with noise.
 
 # %%
 whole = queries.whole_map(slam)
@@ -120,9 +122,9 @@ for landmark in world.landmarks:
 plot_queries(world, None, parts, "The whole map in one vector, unbound")
 
 # %% [markdown]
-# ## Noise, and what a map is good for
-# Phases that wander lose the position; oscillators that pull each other wander less, and landmarks that
-# are met again bring it back.
+# ## Noise, and correction by landmarks
+# Phase noise makes the position estimate drift; coupled oscillators drift less, and landmarks that are seen
+# again correct the estimate.
 #
 # **What to see:** uncoupled, the estimate jumps about; coupled, it drifts; with a map, it drifts less.
 
@@ -149,7 +151,7 @@ plot_trials(
 )
 
 # %% [markdown]
-# **What to see:** errors grow until landmarks are met again.
+# **What to see:** errors grow until landmarks are seen again.
 
 # %%
 panels = {
@@ -163,7 +165,7 @@ plot_errors(drift.time_s, panels, "The same over time")
 
 # %% [markdown]
 # ## The same in spikes
-# Each oscillator is a population; a memory of neurons learns which place belongs to which pointer.
+# Each oscillator is a population; an associative memory of neurons learns the position of each pointer.
 #
 # **What to see:** the object-vector cells and the memory are silent until something comes into view.
 
@@ -205,8 +207,8 @@ plot_rasters(
 )
 
 # %% [markdown]
-# **What to see:** what the memory recalls grows from nothing; the gate stays shut, as what is learnt in this
-# very visit knows no more than the animal does.
+# **What to see:** the recall of the memory grows from zero; the gate stays shut, because a position learnt
+# during this visit adds no information to the estimate.
 
 # %%
 names = ("recall", "agreement", "gate")
@@ -218,8 +220,8 @@ plot_signals(
 
 # %% [markdown]
 # ## Two sessions, one map
-# Another animal begins elsewhere, with its own origin, and knows some of the same landmarks. The maps are
-# laid on each other by what both know.
+# Another animal starts elsewhere, with its own origin, and knows some of the same landmarks. The maps are
+# aligned by the landmarks known to both.
 
 # %%
 shift = np.array([0.15, -0.1])

@@ -1,16 +1,23 @@
 """Fixtures that several test files share."""
 
+import multiprocessing
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from neuroslam.cli import main
 
 torch.set_num_threads(1)
 cv2.setNumThreads(1)
+# How long an example takes is the machine's affair.
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +27,19 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip("no ../shared beside the checkout: real data and references are kept there")
     return folder
+
+
+@pytest.fixture
+def forked(monkeypatch):
+    """Fork the processes of ``--jobs`` from one that has loaded torch, which each else loads anew.
+
+    That they can start from nothing, as they do elsewhere, is for ``test_parallel.py``.
+    """
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["neuroslam.runs.sweep", "neuroslam.runs.fleet"])
+        starts = SimpleNamespace(get_context=lambda _how: context)
+        monkeypatch.setattr("neuroslam.runs.parallel.multiprocessing", starts)
 
 
 @pytest.fixture

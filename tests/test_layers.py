@@ -73,8 +73,6 @@ def test_no_two_files_import_each_other_in_a_circle():
     for module in MODULES.keys() - {FRONT_DOOR}:
         graph.add_edges_from((module, used) for used in imports(MODULES[module]))
     circles = [sorted(c) for c in nx.strongly_connected_components(graph) if len(c) > 1]
-    # Taken out of the circle when the brain is made anew: brain, merge and the three matchings.
-    circles = [c for c in circles if {room_of(module) for module in c} != {"brain"}]
     assert not circles
 
 
@@ -89,7 +87,7 @@ def test_every_file_is_in_a_room_of_the_plan_and_no_room_has_a_second_floor():
 
 def test_the_tests_mirror_the_rooms():
     folders = {p.parent.name for p in Path(__file__).parent.rglob("test_*.py")} - {"tests"}
-    assert folders <= LEVEL.keys()
+    assert folders - {"docs", "typing"} <= LEVEL.keys()  # those two are of no room
 
 
 def test_torchvision_is_imported_through_one_door():

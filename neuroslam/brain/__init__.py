@@ -1,4 +1,4 @@
-"""The brain: everything composed, and its one-file checkpoint."""
+"""The brain: odometry, views, map and populations in one module, and its checkpoint file."""
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.brain.checkpoint import load_brain, read_checkpoint, save_brain

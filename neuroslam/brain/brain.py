@@ -1,75 +1,48 @@
-"""The brain: odometry, views, a map and populations of cells; one frame in, one result out."""
+"""The brain: odometry, views, a map and populations of cells, advanced frame by frame."""
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
 
-from neuroslam.brain.compass import Compass
-from neuroslam.brain.continuity import Continuity
-from neuroslam.brain.recognition import Recognition, StoredViews
-from neuroslam.config import BrainConfig
-from neuroslam.errors import BadFrame, ConfigError, counted
-from neuroslam.geometry import compose
-from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.overlap import n_places
-from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
-from neuroslam.merging.mapped import counts_of, differing
-from neuroslam.merging.match import shared_history
-from neuroslam.merging.merge import merge
-from neuroslam.merging.report import MergeReport
-from neuroslam.odometry.visual import Profiles, VisualOdometry
+from neuroslam.brain.state import BrainState
+from neuroslam.errors import BadFrame
+from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
+    check_image,
     check_instant,
-    check_picture,
     checked_number,
     checked_odometry,
 )
-from neuroslam.state.match import Match
-from neuroslam.state.mergeable import AboutNow, Mergeable, State
+from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
-from neuroslam.state.registry import leading_class, population_classes
-from neuroslam.state.sessions import Session, SessionLog, session_id
-from neuroslam.state.tables import Scalars
+from neuroslam.state.sessions import Session, session_id
 from neuroslam.types import (
     NO_TEMPLATE,
     Frame,
     Motion,
-    Pose,
     PoseEstimate,
     StepResult,
     Velocity,
     ViewMatch,
 )
-from neuroslam.view.features import Encoder, view_encoder
-from neuroslam.view.templates import LocalViewCells
 
 BLIND = ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
 
 
-class Clock(Scalars, AboutNow):
-    """Frame and time the brain is at."""
-
-    frame: int
-    time_s: float
-    frames_seen: int
-
-
 class Accepted(NamedTuple):
-    """A frame that the brain takes, and what was found in it; nothing has changed yet.
+    """A checked frame and the observations in it; the state has not changed yet.
 
     Attributes:
         frame: As the source delivered it.
-        view: Its view, encoded; ``None``: it shows nothing.
-        observed: What each population found, by kind.
-        velocity: Measured, or by visual odometry.
+        view: Its encoded view; ``None``: no image, or one without contrast.
+        observed: Observation of each population, by kind.
+        velocity: Self-motion, measured or from visual odometry.
         dt_s: Time since the last frame.
-        profiles: For the visual odometry of the next frame; ``None``: it was not used.
-        gap: The time since the last frame is too long for the map to go on.
+        profiles: Profiles for the visual odometry of the next frame; ``None``: not used.
+        gap: The time since the last frame exceeds ``max_gap_s``: a new map begins.
     """
 
     frame: Frame
@@ -81,20 +54,20 @@ class Accepted(NamedTuple):
     gap: bool
 
 
-class NavigationBrain(nn.Module):
-    """A stream of frames becomes a map of experiences, by any set of populations side by side.
+class NavigationBrain(BrainState):
+    """Maps a stream of frames with any set of populations.
 
-    ``odometry``, ``view`` and ``map`` are modules that can be used alone; so are the populations
-    that ``config.cells`` names, each an attribute: ``pose_cells`` (RatSLAM), ``navigation``
-    (SLRB), ``semantic`` (SSP-SLAM), or your own. One of them leads: it decides about experiences.
-    All have one belief of where the robot is: self-motion and their own senses move it, memory
-    corrects it, and corrections are exchanged; see :mod:`neuroslam.state.population`.
-    ``state_dict`` holds everything: a brain that is saved, loaded and goes on is bit-equal to one
-    that never stopped.
+    ``odometry``, ``view`` and ``map`` are modules that can be used alone, and so are the
+    populations named in ``config.cells``, each an attribute: ``pose_cells`` (RatSLAM),
+    ``navigation`` (SLRB), ``semantic`` (SSP-SLAM), ``head_direction``, ``speed`` or your own. One
+    of them leads: it decides about experiences. Every population estimates the pose from
+    self-motion and its own senses, corrects it from memory, and receives the corrections of the
+    others; see :mod:`neuroslam.state.population`. ``state_dict`` holds the complete state: a brain
+    that was saved and loaded continues bit for bit like one that never stopped.
 
     Args:
-        config: Every parameter; the defaults suit a forward camera on a small robot.
-        features: Network that makes views, where ``config.view.features`` is ``"module"``; see
+        config: All parameters; the defaults suit a forward camera on a small robot.
+        features: Network that computes views, if ``config.view.features`` is ``"module"``; see
             :class:`~neuroslam.view.features.FeatureEncoder`.
 
     Example:
@@ -105,92 +78,32 @@ class NavigationBrain(nn.Module):
         'create'
     """
 
-    def __init__(
-        self, config: BrainConfig | None = None, *, features: nn.Module | Encoder | None = None
-    ) -> None:
-        super().__init__()
-        self.config = config or BrainConfig()
-        self._encoder = view_encoder(self.config.view, features)
-        self.about = ("", "", "")  # source, preset and date of the next session
-        self._detects = self.config.sessions.kidnapped == "detect"
-        self._after_gap_s = -math.inf  # time of a frame that was refused for a gap before it
-        self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
-        self.stored = nn.ModuleList()
-        self._begin()
-        self.register_load_state_dict_pre_hook(_make_stored)
-        self.register_load_state_dict_post_hook(lambda module, _: module._changed())
+    if TYPE_CHECKING:
 
-    def _begin(self) -> None:
-        """Start with an empty map."""
-        config, cells = self.config, self.config.pose_cells
-        self.odometry = VisualOdometry(config.odometry)
-        self.view = LocalViewCells(config.view, self._encoder)
-        self.map = ExperienceMap(
-            config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
-        )
-        leader = leading_class(config)
-        for population in population_classes(config):
-            setattr(self, population.name, population.build(config, leader))
-        self.compass = Compass()
-        self.sessions = SessionLog()
-        self.recognition = Recognition()
-        self.continuity = Continuity(config)
-        self._changed()
-
-    def _changed(self) -> None:
-        """Collect the populations anew, and forget what follows from the stored maps."""
-        self._stored_views: StoredViews | None = None
-        classes = population_classes(self.config)
-        self._populations: dict[str, Population] = {
-            cls.kind: getattr(self, cls.name) for cls in classes
-        }
-        leader = leading_class(self.config)
-        self._leads = leader.kind
-        # A hook is called where a population has its own: most have few.
-        self._with = {
-            hook: [p for p in self._populations.values() if _overrides(type(p), hook)]
-            for hook in ("observe", "check", "step", "vetoes", "follow", "learn", "recall")
-        }
-        self._makes_views = any(cls.needs_views for cls in classes)
-        uses = {cls.compass for cls in classes}
-        self._has_compass = bool(uses - {"ignores"})
-        self._compass_turns_map = (
-            leader.relaxes_map and self._has_compass and "corrects" not in uses
-        )
-
-    @property
-    def populations(self) -> dict[str, Population]:
-        """The populations by kind, in the order in which they step."""
-        return self._populations
-
-    @property
-    def leader(self) -> Population:
-        """The population that decides about experiences."""
-        return self._populations[self._leads]
-
-    def parts(self) -> dict[str, Mergeable]:
-        """Return the parts that the state is made of, by name."""
-        return {name: p for name, p in self.named_children() if isinstance(p, Mergeable)}
+        def __call__(self, frame: Frame) -> StepResult:
+            """Advance by one frame, as :meth:`forward` does."""
+            ...
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:
         """Advance by one frame.
 
         Raises:
-            BadFrame: If the frame's time does not follow the last one's, or it holds what cannot
-                be, or there is nothing to tell motion from. Nothing has changed then, and the brain
-                can go on with another frame; after a gap the one after next is taken, if it
-                follows.
-            MapError: If it would take the robot out of the space of a population; nothing has
-                changed then either.
+            BadFrame: If the time does not increase, the data is invalid, or there is neither
+                odometry nor an image. The state is unchanged, and another frame can follow; after
+                a gap, the second frame is accepted.
+            MapError: If the robot would leave the space of a population; the state is unchanged.
         """
         accepted = self._accept(frame)
         now = self._enter(accepted)
         observed, leader = accepted.observed, self.leader
-        made = [(p, p.step(now, observed[p.kind])) for p in self._with["step"]]
+        made: list[tuple[Population | None, Correction | None]] = [
+            (p, p.step(now, observed[p.kind])) for p in self._with["step"]
+        ]
         if self._compass_turns_map:
             made.append((None, self.compass.step(now.compass_rad, now.motion)))
-        decision = cells = None
+        decision: Decision | None = None
+        cells: Any = None  # until the leader has decided
         if leader.relaxes_map:
             if any(p.vetoes(now.view) for p in self._with["vetoes"]):
                 now = now._replace(vetoed=True)
@@ -207,22 +120,22 @@ class NavigationBrain(nn.Module):
         return self._finish(accepted, now, decision, cells)
 
     def _accept(self, frame: Frame) -> Accepted:
-        """Find in a frame what the brain has cells for; whatever is refused is refused here."""
+        """Check a frame and compute its observations; every refusal happens here."""
         try:
             dt_s = self._elapsed(frame)
             observed = dict.fromkeys(self._populations)
             if self._has_compass and frame.heading_rad is not None:
                 checked_number(frame.heading_rad, "heading", "rad")
             if frame.image is not None:
-                check_picture(frame.image)
+                check_image(frame.image)
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None
             if self._makes_views and frame.image is not None:
-                view = self.view.look(frame.image)
+                view = self.view.usable_view(frame.image)
             velocity, profiles = self._velocity(frame, dt_s)
             gap = dt_s > self.config.max_gap_s
-            if not gap and self._with["check"]:  # after a gap there is another map
+            if not gap and self._with["check"]:  # after a gap a new map begins
                 self._check(frame, observed, Motion(*velocity, dt_s))
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
@@ -235,7 +148,7 @@ class NavigationBrain(nn.Module):
             population.check(now, observed[population.kind], belief)
 
     def _enter(self, accepted: Accepted) -> StepInput:
-        """Begin a frame: recognise its view, on a new map where the robot did not drive there."""
+        """Begin a frame: start a new map after a gap or a kidnapping, and match the view."""
         frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)
@@ -244,17 +157,17 @@ class NavigationBrain(nn.Module):
         if gap or kidnapped:
             self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
-                velocity = Velocity(0.0, 0.0)  # pictures of two places say nothing of motion
+                velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
-        match = BLIND if view is None else self.view.recognise(view)
+        match = BLIND if view is None else self.view.match_or_learn(view)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
-        """Let the map and all populations follow corrections, but for their authors."""
-        some = [(author, c) for author, c in made if c is not None and not c.is_nothing]
+        """Apply corrections to the map and to all populations but their authors."""
+        some = [(author, c) for author, c in made if moves_others(author, c)]
         if not some:
             return
         leader = self.leader
@@ -269,15 +182,15 @@ class NavigationBrain(nn.Module):
     def _finish(
         self, accepted: Accepted, now: StepInput, decision: Decision, cells: PoseEstimate
     ) -> StepResult:
-        """End a frame: count it, and join a stored map where it is surely recognised."""
+        """End a frame: count it, and join a stored map if enough experiences are recognised."""
         frame, view, (action, experience) = accepted.frame, now.view, decision
         self.clock.frame, self.clock.time_s = frame.index, float(frame.time_s)
         self.clock.frames_seen += 1
         self._after_gap_s = -math.inf
         self.sessions.now.frames += 1
         lost = any(population.lost for population in self._populations.values())
-        arrived = accepted.view is not None and action in ("create", "link")
-        if arrived and self._recognise(frame, accepted.view, view):
+        encoded, arrived = accepted.view, action in ("create", "link")
+        if arrived and encoded is not None and self._recognise(frame, encoded, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.leader.estimate, "set", self.map.current
         return StepResult(
@@ -295,120 +208,9 @@ class NavigationBrain(nn.Module):
             lost=lost,
         )
 
-    def merge(
-        self, partial: "NavigationBrain", match: Match
-    ) -> tuple["NavigationBrain | None", MergeReport]:
-        """Merge the map of another session into this one; neither brain is altered.
-
-        Args:
-            partial: The brain whose session goes on: its activity, time and odometry are kept.
-            match: Where the two maps meet, as :func:`~neuroslam.merging.match.find_match` tells.
-
-        Returns:
-            The merged brain, or ``None`` where the merge is refused, and the report.
-
-        Raises:
-            MapError: If the match names experiences that are not there.
-        """
-        state, _, report = merge(self, partial, match)
-        if state is None:
-            return None, report
-        merged = NavigationBrain(partial.config)
-        merged.restore(state, [*map(deepcopy, self.stored), *map(deepcopy, partial.stored)])
-        merged.to(partial.map.experiences["pose"].device)
-        counts = [counts_of(brain) for brain in (self, partial, merged)]
-        report.counts |= {
-            name: dict(zip(("loaded", "partial", "merged"), values, strict=True))
-            for name, value in counts[2].items()
-            if name not in report.counts and isinstance(value, int)
-            for values in ([count[name] for count in counts],)
-        }
-        merged.sessions.merges.append(report.to_dict())
-        return merged, report
-
-    def store(self, other: "NavigationBrain") -> None:
-        """Remember the maps of another brain; when one is recognised, it is joined to this map.
-
-        Args:
-            other: It is not altered; the maps that it has stored itself are taken too.
-
-        Raises:
-            ConfigError: If views or pose cells of the two were made with different configs, or
-                views by another network.
-        """
-        self.view.load_network()
-        apart = differing(self, other)
-        if apart:
-            raise ConfigError(
-                f"a stored map was made with another config: {'; '.join(apart)}; "
-                "run with the stored map's config"
-            )
-        for one in (other, *other.stored):
-            if one.map.n:
-                self._store_one(one)
-        self._changed()
-
-    def _store_one(self, one: "NavigationBrain") -> None:
-        copy = NavigationBrain(one.config)
-        copy.restore(one.state_dict(), [])
-        for i, before in enumerate(self.stored):
-            shared = shared_history(before, copy)
-            merged = before.merge(copy, shared.match)[0] if shared and shared.match else None
-            if merged is not None:  # what became of one map in two sessions
-                self.stored[i] = merged
-                return
-        self.stored.append(copy)
-        self.recognition.store()
-
-    def start_new_map(self, why: str = "kidnapped") -> None:
-        """Go on with an empty map, for the robot is no longer where it was.
-
-        The map so far is stored; it is joined again when a place of it is recognised.
-
-        Args:
-            why: ``kidnapped``, or ``gap``; kept with the new session.
-        """
-        if not self.map.n:
-            return
-        before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
-        senses = self.odometry, self.continuity  # they go on: this frame is the next one's before
-        kept = NavigationBrain(self.config)
-        kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
-        self.stored.append(kept)
-        self._begin()
-        self.odometry, self.continuity = senses
-        for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
-            self.recognition.tally.append(alike=alike, agreed=agreed)
-        self.recognition.store()
-        session = Session(
-            session_id(before.id, clock.frames_seen, why),
-            before.source,
-            before.preset,
-            before.recorded,
-            clock.frame + 1,
-            clock.time_s,
-            began=why,
-            continues=before.id,
-        )
-        self._open(session)
-
-    def restore(self, state: State, stored: Sequence["NavigationBrain"]) -> None:
-        """Go on with another state, and with these stored maps."""
-        self._begin()
-        self.stored = nn.ModuleList(stored)
-        own = {name: value for name, value in state.items() if not name.startswith("stored.")}
-        for i, one in enumerate(stored):
-            own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
-        self.load_state_dict(own)
-        tally = self.recognition.tally
-        rows = {name: tally[name][: len(stored)] for name in tally.columns}
-        tally.replace(**rows)
-        while tally.n < len(stored):
-            tally.append(alike=0, agreed=0)
-
     def _name_session(self, frame: Frame, observed: dict[str, Any]) -> None:
-        """Open a session; its id follows from what it begins with."""
-        found = []
+        """Open a session; its id is a hash of config, source and first frame."""
+        found: list[Any] = []
         for observation in observed.values():
             found += observation if isinstance(observation, tuple) else [observation]
         self._open(
@@ -430,112 +232,6 @@ class NavigationBrain(nn.Module):
             )
         )
 
-    def _open(self, session: Session) -> None:
-        self.sessions.sessions.append(session)
-        self.map.state.session = session.id
-
-    def _recognise(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
-        """Join a stored map if this place is surely one of it."""
-        config, recognition = self.config.sessions, self.recognition
-        if not len(self.stored):
-            return False
-        recognition.arrive(WINDOW * config.confirm)
-        if self._stored_views is None:
-            self._stored_views = StoredViews([one.view for one in self.stored])
-        where, seen = self._stored_views.search(encoded)
-        if seen.template == NO_TEMPLATE:
-            return False
-        loaded = self.stored[where].map
-        templates = loaded.experiences["template"].numpy()
-        recognition.note(
-            where,
-            np.flatnonzero(templates == seen.template),
-            self.map.current,
-            seen.relative_heading_rad - view.relative_heading_rad,
-            seen.error,
-        )
-        limits = tolerance((loaded, self.map), self.config)
-        agreed = recognition.confirmed(where, loaded, self.map, limits)
-        if n_places(agreed) < config.confirm:
-            return False
-        near = templates[~elsewhere(loaded, int(agreed.loaded[-1]), limits)]
-        match = Match(
-            loaded=int(agreed.loaded[-1]),
-            partial=self.map.current,
-            turn_rad=float(agreed.turn_rad[-1]),
-            error=seen.error,
-            runner_up=self._stored_views.runner_up(encoded, where, near),
-            others=agreed.pick(slice(-1)),
-        )
-        return self._join(where, match, frame)
-
-    def _join(self, where: int, match: Match, frame: Frame) -> bool:
-        """Join stored map ``where``, and then those that share a session with it."""
-        rest = [one for i, one in enumerate(self.stored) if i != where]
-        loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
-        self.stored = nn.ModuleList()  # what else is stored is neither copied nor looked at
-        merged, report = loaded.merge(self, match)
-        self.stored = everything
-        report.at_frame = frame.index
-        if merged is None:
-            self.recognition.forget()
-            self.sessions.refusals.append(report.to_dict())
-            return False
-        merged.sessions.merges[-1] = report.to_dict()
-        for name, part in merged.parts().items():
-            setattr(self, name, part)
-        self.view.encoder = self._encoder
-        self.stored = nn.ModuleList(rest)
-        rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
-        for i, (alike, agreed) in enumerate(rows):
-            if i != where:
-                self.recognition.tally.append(alike=alike, agreed=agreed)
-        self._changed()
-        for i, one in enumerate(rest):
-            shared = shared_history(one, self)
-            if shared is not None and shared.match is not None:
-                self._join(i, shared.match, frame)
-                break
-        return True
-
-    def not_joined(self) -> list[dict[str, object]]:
-        """Say of each stored map how much of it was recognised, for the report of a run."""
-        tally, needed = self.recognition.tally, self.config.sessions.confirm
-        return [
-            {
-                "sessions": [session.name for session in one.sessions.sessions],
-                "experiences": one.map.n,
-                "places_that_look_alike": alike,
-                "places_that_agree": agreed,
-                "reason": "maps without views are laid on each other when they are finished: "
-                "neuroslam merge"
-                if not self._makes_views
-                else f"{counted(alike, 'place')} looked like one of it, {agreed} at most agreed on "
-                f"how the maps lie; {needed} must",
-            }
-            for one, alike, agreed in zip(
-                self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
-            )
-        ]
-
-    @property
-    def landmarks_m(self) -> np.ndarray | None:
-        """Points that populations want drawn on the map, ``(n, 2)``; ``None``: none has any."""
-        points = [p.points_m() for p in self._populations.values()]
-        known = [rows for rows in points if rows is not None]
-        return np.concatenate(known) if known else None
-
-    def place(self, experience: int, offset: Pose) -> Pose:
-        """Return where a robot is, on the map as it is now, that was at ``offset`` from a place.
-
-        Args:
-            experience: Id, or -1 for the origin before the first experience.
-            offset: Pose relative to that experience, as ``map.offset`` gave it at the time.
-        """
-        if experience < 0:
-            return offset
-        return compose(Pose(*self.map.experiences["pose"][experience].tolist()), offset)
-
     def _elapsed(self, frame: Frame) -> float:
         check_instant(frame)
         if not self.clock.frames_seen:
@@ -543,7 +239,7 @@ class NavigationBrain(nn.Module):
         dt_s = frame.time_s - self.clock.time_s
         if not dt_s > 0.0:  # NaN too
             raise BadFrame(
-                f"time {frame.time_s:g} s does not follow {self.clock.time_s:g} s "
+                f"time {float(frame.time_s)} s does not follow {self.clock.time_s} s "
                 f"of frame {self.clock.frame}; times must rise"
             )
         if dt_s > self.config.max_gap_s and self.config.sessions.after_gap == "new_map":
@@ -551,11 +247,12 @@ class NavigationBrain(nn.Module):
         if dt_s > self.config.max_gap_s:
             since_s = frame.time_s - self._after_gap_s
             if 0.0 < since_s <= self.config.max_gap_s:
-                return float(since_s)  # the gap is real: what was missed in it stays unknown
+                return float(since_s)  # the gap is real; the motion in it stays unknown
             self._after_gap_s = float(frame.time_s)
             raise BadFrame(
-                f"{dt_s:g} s after frame {self.clock.frame}, more than "
-                f"max_gap_s = {self.config.max_gap_s:g}; raise it if the gap is real"
+                f"{round(float(dt_s), 6)} s after frame {self.clock.frame}; expected at most "
+                f"max_gap_s = {self.config.max_gap_s} s; raise it, or set sessions.after_gap = "
+                "'new_map', if the gap is real"
             )
         return float(dt_s)
 
@@ -569,15 +266,3 @@ class NavigationBrain(nn.Module):
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
         return self.odometry.measure(frame.image, dt_s)
-
-
-def _overrides(population: type[Population], hook: str) -> bool:
-    return getattr(population, hook) is not getattr(Population, hook)
-
-
-def _make_stored(module: NavigationBrain, state: State, prefix: str, *_unused: object) -> None:
-    """Make as many stored maps as a state has."""
-    inside = f"{prefix}stored."
-    numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
-    if len(numbers) != len(module.stored):
-        module.stored = nn.ModuleList(NavigationBrain(module.config) for _ in numbers)

@@ -1,4 +1,4 @@
-"""One file for a whole brain: safetensors, checked, written at once or not at all. No pickle."""
+"""Checkpoints: one safetensors file per brain, checked, written atomically, without pickle."""
 
 import warnings
 from pathlib import Path
@@ -16,22 +16,22 @@ FORMAT_VERSION = 4
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> None:
-    """Write config and complete state of a brain to one file, at once or not at all.
+    """Write config and complete state of a brain to one file, atomically.
 
     Args:
         brain: The brain; it is not changed.
-        path: Usually ends in ``.safetensors``.
+        path: File, usually with the suffix ``.safetensors``.
     """
     about = {"format": FORMAT_VERSION, "config": brain.config.model_dump(mode="json")}
     save_checked(path, about, brain.state_dict())
 
 
 def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
-    """Read and check a brain file: its config and its state dict.
+    """Read and check a brain file; return its config and state dict.
 
     Raises:
-        CheckpointError: In one line, what is wrong: missing, not a brain file, a pickle,
-            truncated, of a newer format, altered since it was written, or an unusable config.
+        CheckpointError: If the file is missing, no brain file, a pickle, truncated, of a newer
+            format, altered since it was written, or has an invalid config.
     """
     about, tensors = load_checked(path, "brain", FORMAT_VERSION)
     try:
@@ -49,16 +49,16 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
 
 
 def load_brain(path: str | Path, *, features: nn.Module | None = None) -> NavigationBrain:
-    """Load a brain; going on with it is bit-equal to never having stopped.
+    """Load a brain, which continues bit for bit like one that never stopped.
 
     Args:
         path: The file.
-        features: The network that makes its views, where it was passed to the brain that was
-            saved: files hold maps, and of a network only which it was.
+        features: The network that computes its views, if one was passed to the saved brain: the
+            file holds only a digest of the network.
 
     Raises:
-        ConfigError: If a network is passed to a brain that has another.
-        CheckpointError: If the file cannot be used; one line says why.
+        ConfigError: If another network is passed than the brain was saved with.
+        CheckpointError: If the file cannot be used.
     """
     config, tensors = read_checkpoint(path)
     brain = NavigationBrain(config, features=features)
@@ -72,14 +72,14 @@ def load_brain(path: str | Path, *, features: nn.Module | None = None) -> Naviga
 
 
 def _with_compass(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, Tensor]:
-    """Bring a state of format 2, which knew no compass, to the present one."""
+    """Convert a state of format 2, which has no compass."""
     brains = [name.removesuffix("clock.frame") for name in tensors if name.endswith("clock.frame")]
     fresh = NavigationBrain(config).compass.state_dict()
     return tensors | {f"{one}compass.{name}": v for one in brains for name, v in fresh.items()}
 
 
 def _without_unused(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, Tensor]:
-    """Drop what formats up to 3 had besides: the time of a gap, pose cells that nothing used."""
+    """Drop what formats up to 3 had in addition: the time of a gap, unused pose cells."""
     unused = (".after_gap_s",) if "pose" in config.cells else (".after_gap_s", ".pose_cells")
     return {
         name: value
@@ -91,14 +91,14 @@ def _without_unused(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str
 def _of_one_session(
     tensors: dict[str, Tensor], config: BrainConfig, digest: str
 ) -> dict[str, Tensor]:
-    """Bring a state of format 1, which knew no sessions, to the present one: it is one session."""
+    """Convert a state of format 1, which has no sessions, to one session."""
     brain = NavigationBrain(config)
     session = session_id(digest)
     brain.sessions.sessions.append(Session(session, frames=int(tensors["clock.frames_seen"])))
     fresh = brain.state_dict()
-    places, blocks = "map.experiences.template", "view.templates.blocks"
-    tensors = {name: tensors.get(name, value) for name, value in fresh.items()}
-    n = len(tensors[places])
+    experiences, blocks = "map.experiences.template", "view.templates.blocks"
+    tensors = {name: tensors[name] if name in tensors else fresh[name] for name in fresh}
+    n = len(tensors[experiences])
     tensors["map.experiences.session"] = torch.full((n,), session)
     tensors["map.experiences.number"] = torch.arange(n)
     tensors["map.state.session"] = torch.tensor(session)

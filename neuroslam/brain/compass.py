@@ -1,4 +1,4 @@
-"""The compass of a brain whose populations tell nobody what it says: it turns the map slowly."""
+"""The compass of a brain without a population that corrects by compass: it turns the map."""
 
 import math
 
@@ -8,11 +8,11 @@ from neuroslam.state.population import Correction
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Motion
 
-_AVERAGED_S = 2.0  # over which the noise of a compass is averaged
+_AVERAGED_S = 2.0  # time constant of the average over compass noise
 
 
 class Compass(Scalars, AboutNow):
-    r"""Heading of the robot by compass and turns together, as the map has taken it over.
+    r"""Heading of the robot from compass and turn rate, as applied to the map.
 
     A complementary filter: :math:`\theta \leftarrow \theta + \omega\,\Delta t + (1 - e^{-\Delta t /
     \tau})(\theta_c - \theta)`, with :math:`\tau` = 2 s.
@@ -25,11 +25,11 @@ class Compass(Scalars, AboutNow):
         super().__init__(heading_rad=0.0, known=0)
 
     def step(self, heading_rad: float | None, motion: Motion) -> Correction | None:
-        """Advance by a frame; return by how much the map turns to follow the compass.
+        """Advance by a frame; return the turn of the map towards the compass.
 
         Args:
-            heading_rad: Measured; ``None``: not in this frame.
-            motion: Since the last frame.
+            heading_rad: Measured heading; ``None``: not in this frame.
+            motion: Motion since the last frame.
         """
         if heading_rad is None and not self.known:
             return None

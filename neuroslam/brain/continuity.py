@@ -1,4 +1,4 @@
-"""Was the robot kidnapped? Its view changes at once by more than it does in driving."""
+"""Detection of kidnapping: a sudden change of view, larger than the changes while driving."""
 
 import math
 
@@ -14,19 +14,33 @@ from neuroslam.view.search import Geometry, distances
 from neuroslam.view.templates import to_bytes
 
 _SETTLED = 30
-"""Frames after which the usual change is known."""
+"""Frames after which the median change is known."""
 
 _STEP = 0.02
-"""Share by which the usual change is corrected in a frame, once it is known roughly."""
+"""Relative step of the running median per frame."""
+
+
+class Change(Scalars):
+    """How the views of a drive change.
+
+    Attributes:
+        frames: How many were compared.
+        usual: Running median of the change between two.
+        turned: By how many columns of a view the robot turned since the last one.
+    """
+
+    frames: int
+    usual: float
+    turned: float
 
 
 class Continuity(AboutNow):
-    r"""Tells from two frames whether the robot could have driven from one to the other.
+    r"""Decides from two successive views whether the robot was kidnapped between them.
 
     The change :math:`d` between two frames is the mean difference of their views at the best shift.
-    It was kidnapped if :math:`d > \max(\theta, f\,\tilde d)`: they would not be the same view, and
-    :math:`d` is :math:`f` times the running median. A turn faster than the views can be shifted
-    by makes such a change too, and is let pass.
+    The robot was kidnapped if :math:`d > \max(\theta, f\,\tilde d)`, with the match threshold
+    :math:`\theta`, the factor :math:`f` and the running median :math:`\tilde d`. A turn beyond
+    the range of shifts makes such a change too and is ignored.
     """
 
     before: Tensor
@@ -38,15 +52,15 @@ class Continuity(AboutNow):
         self.shift = math.inf if config.view.panoramic else config.view.shift_match
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
         self.geometry = Geometry.of(config.view)
-        self.state = Scalars(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
+        self.state = Change(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
         n_pixels = config.view.template_width * config.view.template_height
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 
     def breaks(self, view: np.ndarray) -> bool:
-        """Compare a view with the one before it, and remember it.
+        """Return whether the change since the previous view is a kidnapping; store the view.
 
         Args:
-            view: As :meth:`~neuroslam.view.templates.LocalViewCells.encode` makes it.
+            view: View from :meth:`~neuroslam.view.templates.LocalViewCells.encode`.
         """
         s, query = self.state, to_bytes(view.T)
         before, self.before = self.before, torch.from_numpy(query.reshape(-1))
@@ -66,5 +80,5 @@ class Continuity(AboutNow):
         return broken
 
     def moved(self, velocity: Velocity, dt_s: float) -> None:
-        """Remember how fast the robot turned, for the next comparison."""
+        """Store the turn of the robot for the next comparison."""
         self.state.turned = abs(velocity.w_rad_s) * dt_s * self.columns_per_rad

@@ -1,4 +1,4 @@
-"""Is this a place of a stored map? Views say where it looks alike, their order whether it is."""
+"""Recognition of stored maps: view matches, and their agreement on the alignment of the maps."""
 
 from collections.abc import Sequence
 
@@ -16,10 +16,10 @@ from neuroslam.view.templates import LocalViewCells
 
 
 class StoredViews:
-    """The templates of several maps as one memory, so that one search finds the nearest of all.
+    """The templates of several maps as one memory, searched in one pass.
 
     Args:
-        views: Of maps with equal configs, at least one.
+        views: Templates of at least one map, all with equal configs.
     """
 
     def __init__(self, views: Sequence[LocalViewCells]) -> None:
@@ -33,48 +33,53 @@ class StoredViews:
         self.starts = np.cumsum([0, *(one.n for one in views)])
 
     def search(self, view: np.ndarray) -> tuple[int, ViewMatch]:
-        """Find the nearest template of all maps; returns its map and the match.
+        """Return the map of the nearest template of all maps, and the match.
 
-        The template is numbered as in its map; ``NO_TEMPLATE`` where none is within the threshold.
+        The template has its number in that map; ``NO_TEMPLATE`` if none is within the threshold.
         """
         threshold = self.joined.config.threshold
         match = self.joined.search(view, threshold)
         if match.template == NO_TEMPLATE or match.error > threshold:
             return -1, match._replace(template=NO_TEMPLATE)
-        self.joined.last.template = match.template  # the next is likely to be beside it
+        self.joined.last.template = match.template  # the next match is likely next to it
         where = int(np.searchsorted(self.starts, match.template, side="right")) - 1
         return where, match._replace(template=match.template - int(self.starts[where]))
 
     def runner_up(self, view: np.ndarray, where: int, near: np.ndarray) -> float | None:
-        """Return the smallest difference to any template but those ``near`` of map ``where``."""
+        """Return the smallest match error with templates except ``near`` of map ``where``."""
         rest = np.setdiff1d(np.arange(self.joined.n), self.starts[where] + near)
         return min(self.joined.differences(view, rest), default=None)
 
 
+class Arrivals(Scalars):
+    """How often the robot has come to a place."""
+
+    arrivals: int
+
+
 class Recognition(Mergeable):
-    """What was recognised of stored maps lately: the evidence for joining one."""
+    """Recent view matches with stored maps: the evidence for joining one."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.state = Scalars(arrivals=0)
+        self.state = Arrivals(arrivals=0)
         integers = ("arrival", "map", "loaded", "partial")
         self.sightings = GrowingTable(
             {name: ((), torch.int64) for name in integers}
             | {name: ((), torch.float64) for name in ("turn_rad", "error")}
         )
-        # For each stored map: how many places looked alike, how many of them agreed at best.
+        # For each stored map: number of matched experiences, and the most that agreed.
         self.tally = GrowingTable({"alike": ((), torch.int64), "agreed": ((), torch.int64)})
 
-    @staticmethod
-    def merged(_loaded: State, partial: State, _join: Join) -> State:
-        """Begin anew: the ids have changed."""
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Drop all matches: the ids have changed."""
         return {
             name: value if name.startswith("state.") else value[:0]
             for name, value in partial.items()
         }
 
     def arrive(self, window: int) -> None:
-        """Note that the robot came to a place, and forget what is more than ``window`` ago."""
+        """Count an arrival at an experience; drop matches more than ``window`` arrivals ago."""
         self.state.arrivals += 1
         recent = self.sightings["arrival"] > self.state.arrivals - window
         if not recent.all():
@@ -84,10 +89,10 @@ class Recognition(Mergeable):
     def note(
         self, where: int, loaded: np.ndarray, partial: int, turn_rad: float, error: float
     ) -> None:
-        """Note that the place looks like these places of a stored map."""
-        for one in loaded.tolist():
+        """Store the view match of an experience with experiences of a stored map."""
+        for experience in loaded.tolist():
             self.sightings.append(
-                arrival=self.state.arrivals, map=where, loaded=one, partial=partial,
+                arrival=self.state.arrivals, map=where, loaded=experience, partial=partial,
                 turn_rad=turn_rad, error=error,
             )  # fmt: skip
         self.tally["alike"][where] += 1
@@ -95,7 +100,7 @@ class Recognition(Mergeable):
     def confirmed(
         self, where: int, loaded: ExperienceMap, partial: ExperienceMap, limits: Tolerance
     ) -> Pairs:
-        """Return the places that agree with the one where the robot is, that one last."""
+        """Return the matches that agree with that of the current experience, which comes last."""
         of_map = {
             name: column[self.sightings["map"] == where].numpy()
             for name, column in ((name, self.sightings[name]) for name in self.sightings.columns)
@@ -112,9 +117,9 @@ class Recognition(Mergeable):
         return Pairs.of([])
 
     def store(self) -> None:
-        """Make room for the evidence of another stored map."""
+        """Add a row for another stored map."""
         self.tally.append(alike=0, agreed=0)
 
     def forget(self) -> None:
-        """Drop all sightings: what they led to was tried."""
+        """Drop all matches after a refused merge."""
         self.sightings.replace(**{n: self.sightings[n][:0] for n in self.sightings.columns})

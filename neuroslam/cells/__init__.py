@@ -1,4 +1,4 @@
-"""Cells whose activity says where the animal is."""
+"""Populations of cells whose activity encodes the pose of the animal."""
 
 from neuroslam.cells.boundary import BoundaryCells
 from neuroslam.cells.convolve import circular_convolve, gaussian_kernel, ring_convolve

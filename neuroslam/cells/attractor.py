@@ -1,4 +1,4 @@
-r"""The dynamics that pose cells, and any other attractor on a torus, share: pure functions."""
+r"""Pure functions: the dynamics of pose cells and other attractors on a torus."""
 
 import math
 from functools import lru_cache
@@ -36,8 +36,8 @@ def couplings(
     """Prepare the products of :func:`settle` for a window of ``sizes`` on a torus of ``shape``."""
     pairs = []
     for up, down, size, n in zip(excite, inhibit, sizes, shape, strict=True):
-        # E then I is one kernel, E * I: full convolution of the two. Where E does not reach there
-        # is nothing but inhibition, and so no activity: those cells need no rows.
+        # E then I is one kernel, E * I: full convolution of the two. Cells beyond the reach of E
+        # are only inhibited, hence silent: they need no rows.
         both = torch.nn.functional.conv1d(
             up[None, None], down.flip(0)[None, None], padding=down.shape[0] - 1
         )[0, 0]
@@ -85,7 +85,7 @@ def settle(
     if total.min().item() <= 0.0:
         raise MapError(
             "pose cells: inhibition silenced every cell; global_inhibition "
-            f"{global_inhibition:g} is above all activity, lower it"
+            f"{global_inhibition:g} is above all activity; lower it"
         )
     field = (field / total).reshape(
         *batch, coupled.theta.shape[0], coupled.y.shape[-2], coupled.x.shape[-1]
@@ -121,7 +121,7 @@ def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Te
         [0.75, 0.25]
     """
     apart = _offsets(first, n_out, n_in, shift.dtype, shift.device) - shift[..., None, None]
-    if n_out == n:  # the only case in which two cells are near each other the other way round
+    if n_out == n:  # only then can two cells be nearer across the wrap-around
         apart = apart - n * torch.round(apart / n)
     return (1.0 - apart.abs()).clamp_min(0.0)
 
@@ -148,16 +148,16 @@ def path_integrate(
     turn_cells: float,
     aside_cells: tuple[float, float] = (0.0, 0.0),
 ) -> Packet:
-    r"""Move every layer along its heading, then turn all layers: activity follows odometry.
+    r"""Move every layer along its heading, then all layers along theta: activity follows odometry.
 
     Layer :math:`k` moves by :math:`d` along :math:`\theta_k = 2\pi k / n_\theta` (bilinear), then
-    activity moves along theta (linear). Any distance, backward too; a lap of the torus comes home.
+    activity moves along theta (linear). Any distance, also backward; activity wraps around.
 
     Args:
         packet: Activity of one brain, values ``(a, b, c)``.
         distance_cells: :math:`d = v\,dt / \text{cell size}`.
         turn_cells: :math:`\omega\,dt\,n_\theta / 2\pi`.
-        aside_cells: x and y by which all layers move besides.
+        aside_cells: Displacement of all layers along x and y.
 
     Returns:
         Activity of the same sum.
@@ -191,26 +191,27 @@ def moved_cells(
     pivot: np.ndarray,
     shift: np.ndarray,
     torus: tuple[int, int, int],
-    way: np.ndarray | None = None,
+    paths: np.ndarray | None = None,
 ) -> np.ndarray:
-    r"""Move pose-cell states on the torus so that one of them comes to lie on another.
+    r"""Move pose-cell states on the torus so that the pivot coincides with another state.
 
     .. math:: P' = P + \Delta \pmod n, \qquad \Delta = P_u - P_z
 
-    (Multisession RatSLAM, Eqs. 10 and 11; Eq. 10 is misprinted there.) Where a session began with
-    another heading, its ways run in other directions too, so with ``way`` they are turned,
+    (Multisession RatSLAM, Eqs. 10 and 11; Eq. 10 is misprinted there.) If the two
+    sessions started with different headings, displacements differ in direction too; with ``paths``
+    they are rotated,
 
     .. math:: P' = P_u + R(\Delta_\theta)\,(P - P_z)_\text{unwrapped} \pmod n
 
-    and a robot that comes to such a place from the other session finds its activity there. How
-    often the way from :math:`P_z` to :math:`P` went round the torus is what it is nearest to.
+    so that a robot that comes there in the other session has its activity there. The displacement
+    from :math:`P_z` to :math:`P` is unwrapped to the value nearest to ``paths``.
 
     Args:
         cells: x, y, theta in cells, ``(n, 3)``.
         pivot: :math:`P_z`, ``(3,)``.
         shift: :math:`\Delta` in cells, ``(3,)``; any fraction.
         torus: ``(n_x, n_y, n_theta)``.
-        way: Ways from the pivot as the map has them, in cells, ``(n, 2)``; ``None``: only shift.
+        paths: Displacements from the pivot on the map, in cells, ``(n, 2)``; ``None``: shift only.
 
     Example:
         >>> moved_cells(np.array([[20.5, 3.0, 1.0]]), None, np.array([1, 0, -2]), (21, 21, 36))
@@ -218,9 +219,9 @@ def moved_cells(
     """
     n = np.array(torus, dtype=np.float64)
     moved = cells + shift
-    if way is not None:
+    if paths is not None:
         apart = cells[:, :2] - pivot[:2]
-        apart = apart + n[:2] * np.round((way - apart) / n[:2])
+        apart = apart + n[:2] * np.round((paths - apart) / n[:2])
         angle = TWO_PI * shift[2] / n[2]
         c, s = math.cos(angle), math.sin(angle)
         x, y = apart.T
@@ -256,7 +257,7 @@ def inject(packet: Packet, at: PoseEstimate, energy: float) -> Packet:
 
 
 def decode(packet: Packet, radius: int) -> PoseEstimate:
-    r"""Find the dominant packet: the most active cell, then the population vector around it.
+    r"""Decode the dominant packet: the most active cell, then the population vector around it.
 
     .. math:: \hat x = \frac{n_x}{2\pi} \operatorname{atan2}
               \Big(\sum_i p_i \sin\tfrac{2\pi i}{n_x}, \sum_i p_i \cos\tfrac{2\pi i}{n_x}\Big)
@@ -275,7 +276,7 @@ def decode(packet: Packet, radius: int) -> PoseEstimate:
     peak = int(values.argmax())
     peaks = (peak // (b * c), peak // c % b, peak % c)
     whole = [size == n for size, n in zip((a, b, c), packet.shape, strict=True)]
-    if any(whole):  # bring the peak to the middle, so that its neighbourhood does not wrap
+    if any(whole):  # roll the peak to the middle, so that its neighbourhood does not wrap
         rolls = [
             size // 2 - p if w else 0 for size, p, w in zip((a, b, c), peaks, whole, strict=True)
         ]

@@ -1,4 +1,4 @@
-"""Boundary cells: the animal's distance and direction to walls, as rates of a population."""
+"""Boundary cells: a population whose rates encode distance and bearing of walls."""
 
 import math
 
@@ -15,11 +15,11 @@ from neuroslam.state.mergeable import BufferModule
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
 """Zones of the activity of boundary cells, from far to near."""
 
-_FAR_M = 1e3  # where no cell responds; infinity would make gradients of nothing
+_FAR_M = 1e3  # where no cell responds; infinity would give NaN gradients
 
 
 def boundary_zone(distance_m: Tensor, reach_m: float) -> Tensor:
-    r"""Tell in which zone an animal is, by its distance :math:`R` to the nearest wall.
+    r"""Return the zone of an animal by its distance :math:`R` to the nearest wall.
 
     .. math:: S = \text{inhibition } (R > b), \quad
               \text{attenuation } (b/2 < R \le b), \quad \text{growth } (R \le b/2)
@@ -36,13 +36,13 @@ def boundary_zone(distance_m: Tensor, reach_m: float) -> Tensor:
 def boundary_activity(
     activity: Tensor, distance_m: Tensor, reach_m: float, rate_per_s: float, dt_s: float
 ) -> Tensor:
-    r"""Let the activity grow near a wall, fade farther off, and end beyond reach.
+    r"""Return the activity after a step: it grows near a wall, decays farther off, 0 beyond reach.
 
     .. math:: \dot h = \pm\tau\,\frac{b - R}{b}, \qquad 0 \le h \le 1
 
     plus in the growth zone, minus in the attenuation zone; 0 in the inhibition zone (SLRB, Eq. 5,
-    as a rate and bounded: the printed recursion adds without end and takes the distance straight
-    ahead for that to the wall).
+    as a rate and bounded: the printed recursion is unbounded, and takes the distance straight ahead
+    for that to the wall).
 
     Args:
         activity: :math:`h`, any shape.
@@ -136,7 +136,7 @@ class BoundaryCells(BufferModule):
         self.sigma_rad = nn.Parameter(torch.tensor(config.sigma_bearing_rad))
 
     def forward(self, distance_m: Tensor, bearing_rad: Tensor, dt_s: float) -> Tensor:
-        """Take in the walls around and return the rates.
+        """Return the rates for the walls in sight.
 
         Args:
             distance_m: Distance to the foot of the perpendicular on each wall,
@@ -154,7 +154,7 @@ class BoundaryCells(BufferModule):
         return self.respond(distance_m, bearing_rad, dt_s)
 
     def respond(self, distance_m: Tensor, bearing_rad: Tensor, dt_s: float) -> Tensor:
-        """Do as :meth:`forward` with walls that were checked."""
+        """Do as :meth:`forward`, without checking the walls."""
         c = self.config
         distance_m, bearing_rad = distance_m.to(self.activity), bearing_rad.to(self.activity)
         self.activity = boundary_activity(
@@ -174,7 +174,7 @@ class BoundaryCells(BufferModule):
         return rates
 
     def rest(self) -> None:
-        """Do as with no wall in reach: nothing is active."""
+        """Set all activity to 0, as without a wall in reach."""
         self.activity = torch.zeros_like(self.activity)
         self.rates = torch.zeros_like(self.rates)
 
@@ -186,13 +186,13 @@ def _nearest(distance_m: Tensor) -> Tensor:
 
 
 def checked_walls(walls: object) -> np.ndarray:
-    """Return the walls of a frame, if a sensor can have measured them.
+    """Return the walls of a frame as ``float64``, after checking them.
 
     Args:
         walls: Distance (m) and bearing (rad) of each, ``(n, 2)``.
 
     Returns:
-        The same, ``float64``.
+        Array of shape ``(n, 2)``.
 
     Raises:
         BadFrame: If they have another shape or type, or :func:`check_walls` refuses them.
@@ -208,7 +208,7 @@ def checked_walls(walls: object) -> np.ndarray:
 
 
 def check_walls(distance_m: Tensor, bearing_rad: Tensor) -> None:
-    """Refuse distances and bearings that no sensor can have measured.
+    """Raise on distances and bearings that no sensor can measure.
 
     Raises:
         BadFrame: If shapes differ, a distance is negative or NaN, or a bearing not finite.
@@ -229,7 +229,27 @@ def check_walls(distance_m: Tensor, bearing_rad: Tensor) -> None:
     negative = distance_m[~(distance_m >= 0)]
     if len(negative):
         raise BadFrame(
-            f"walls: distance {negative[0].item():g} m; expected 0 or more, inf for none"
+            f"walls: distance {negative[0].item():.6} m; expected 0 or more, inf for none"
         )
     wrong = bearing_rad[~bearing_rad.isfinite()][0].item()
-    raise BadFrame(f"walls: bearing {wrong:g} rad; expected a finite number")
+    raise BadFrame(f"walls: bearing {wrong:.6} rad; expected a finite number")
+
+
+def check_motion(speed_m_s: Tensor, heading_rad: Tensor) -> None:
+    """Raise on speeds and headings that are not finite.
+
+    Raises:
+        BadFrame: If one is not.
+
+    Example:
+        >>> check_motion(torch.tensor(0.1), torch.tensor(float("nan")))
+        Traceback (most recent call last):
+        neuroslam.errors.BadFrame: motion: speed 0.1 m/s, heading nan rad; expected finite numbers
+    """
+    finite = speed_m_s.isfinite() & heading_rad.isfinite()
+    if not bool(finite.all()):
+        speeds, headings = torch.broadcast_tensors(speed_m_s, heading_rad)
+        raise BadFrame(
+            f"motion: speed {speeds[~finite][0].item():.6} m/s, heading "
+            f"{headings[~finite][0].item():.6} rad; expected finite numbers"
+        )

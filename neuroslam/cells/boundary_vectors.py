@@ -1,4 +1,4 @@
-"""Boundary vectors: where an animal was, and the bearing and distance of a wall from there."""
+"""Boundary vectors: bearing and distance of a wall from the position where it was sensed."""
 
 import math
 from typing import NamedTuple
@@ -10,9 +10,15 @@ from neuroslam.geometry import TWO_PI
 
 
 class Wall(NamedTuple):
-    """Columns of the memory: anchor, bearing and distance of a wall from there, its variance.
+    """Remembered walls, one tensor for each column.
 
-    And since when it is remembered, on the animal's clock.
+    Attributes:
+        x_m: Position at which the wall was first sensed (the anchor).
+        y_m: The same along y.
+        bearing_rad: Bearing of the wall from the anchor, in the world.
+        distance_m: Distance of the wall from the anchor.
+        variance_m2: Variance of that distance.
+        made_s: Time at which it was first sensed, since the session began.
     """
 
     x_m: Tensor
@@ -24,22 +30,22 @@ class Wall(NamedTuple):
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Bring angles into [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return (angle + math.pi).remainder(TWO_PI) - math.pi
 
 
 def wall_innovation(
     position_m: Tensor, distance_m: Tensor, bearing_rad: Tensor, wall: Wall
 ) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Compare a wall with the memory of it.
+    r"""Return the innovation of a sensed wall against the memory of it.
 
     .. math:: \nu = R - R_m - (x_m - x) \cdot \mathbf n, \qquad
               \mathbf n = \frac{(\cos\gamma, \sin\gamma)}{\cos((\alpha - \alpha_m)/2)}, \quad
               \gamma = \frac{\alpha + \alpha_m}{2}
 
     The chord between two feet of perpendiculars is normal to the mean bearing: exactly for a
-    straight wall and for a circle, to second order for any other. (With the bearing of now in
-    place of the mean, a curved wall seems the farther the more it curves, and pulls.)
+    straight wall and for a circle, to second order for any other. (With the present
+    bearing in place of the mean, a curved wall seems too far, which biases the position.)
 
     Args:
         position_m: :math:`x`, ``(..., 2)``.
@@ -48,8 +54,8 @@ def wall_innovation(
         wall: :math:`x_m, \alpha_m, R_m`.
 
     Returns:
-        :math:`\nu` in metres; :math:`\mathbf n`, ``(..., 2)``; the lever in metres, distance along
-        the wall between the two places, by which an error of bearing counts.
+        :math:`\nu` in metres; :math:`\mathbf n`, ``(..., 2)``; the lever in metres, the distance
+        along the wall between the two positions, which multiplies an error of bearing.
     """
     half = wrap(bearing_rad - wall.bearing_rad) / 2
     middle = wall.bearing_rad + half
@@ -62,7 +68,7 @@ def wall_innovation(
 def squared_mismatch(
     walls: Tensor, position_m: Tensor, bearing_rad: Tensor, scale: Tensor
 ) -> Tensor:
-    r"""Say how unlike remembered walls are to one that is looked at; below 1 it is the same.
+    r"""Return the squared mismatch of remembered walls with a sensed one; below 1 it is the same.
 
     .. math:: \frac{|x_m - x|^2}{s^2} + \frac{(\alpha_m - \alpha)^2}{a^2}
 

@@ -1,4 +1,4 @@
-"""Familiarity: what walls each place cell has felt, and whether those felt now contradict it."""
+"""Familiarity: the walls known at each place cell, and whether the present ones contradict them."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,17 @@ from neuroslam.geometry import TWO_PI
 from neuroslam.state.mergeable import BufferModule, without_gradients
 
 SURE = 0.6
-"""Share of the reach within which a wall cannot be overlooked."""
+"""Share of the reach within which a wall is always sensed."""
 
 _NEVER, _ALWAYS = 0.02, 0.98
-_SLACK_BINS = 2  # bearings may be off by so many boundary cells
+_SLACK_BINS = 2  # tolerance of bearing, in boundary cells
 _FAMILIAR_S = 1.0
-_MOST = 5.0  # of the doubt that makes an animal lost
-_FORGIVES = 0.15  # what agrees counts less than what contradicts
+_MOST = 5.0  # largest doubt, as a multiple of that of a lost animal
+_FORGIVES = 0.15  # weight of agreement against that of contradiction
 
 
 class Felt(NamedTuple):
-    """Walls felt now, by the bearing of boundary cells: any, and surely near; ``(batch, n)``."""
+    """Walls sensed, by bearing bin: any within reach, and near ones; ``(batch, n)`` each."""
 
     any: Tensor
     near: Tensor
@@ -32,7 +32,7 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
     Args:
         distance_m: ``(batch, n_walls)``; ``inf`` for none.
         bearing_rad: In the world, the same shape.
-        reach_m: Farther walls are not felt.
+        reach_m: Largest distance at which a wall is sensed.
         n_bearings: Number of bins over the full turn.
 
     Example:
@@ -49,14 +49,14 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
 
 
 class Familiarity(BufferModule):
-    r"""Learns which boundary cells are active at each place cell, and tells when that is broken.
+    r"""Learns which walls are sensed at each place cell, and detects contradictions.
 
-    A wall is near where none ever was, or none is felt where one always was, or one is not where
-    it was remembered: while that lasts, ``doubt_s`` grows by the time. It shrinks, much slower,
-    while a wall that was long known is where it should be: chance lets many walls fit anywhere.
-    Where nothing is felt or known it stays. An animal is ``lost`` when it exceeds ``lost_after_s``,
-    until it is gone. State: seconds of each place cell with each boundary cell (``felt_s``) and in
-    all (``time_s``); the doubt.
+    Walls contradict if one is near where none ever was, or missing where one always was, or not
+    where it was remembered: the doubt ``doubt_s`` grows by the time. It decreases, more slowly,
+    while a wall known for long is where it should be, for many walls fit by chance. Without known
+    or sensed walls it stays. An animal is ``lost`` from when its doubt exceeds ``lost_after_s``
+    until it is 0. State: seconds of each place cell with each bearing (``felt_s``) and in all
+    (``time_s``); the doubt.
 
     Args:
         config: Of the boundary cells.
@@ -96,14 +96,14 @@ class Familiarity(BufferModule):
         evidence: tuple[Tensor, Tensor],
         dt_s: float,
     ) -> Tensor:
-        """Compare the walls around with those known of the place; returns who is lost.
+        """Compare the walls with those known at the place cell; return which animals are lost.
 
         Args:
-            winner: Number of the place cell that won, ``(batch or 1,)``; -1 for none.
+            winner: Number of the winning place cell, ``(batch or 1,)``; -1 for none.
             distance_m: Distances to walls, ``(batch or 1, n_walls)``; ``inf`` for none.
             bearing_rad: Their bearings in the world, the same shape.
-            evidence: Against and for where the animal believes to be, as
-                :meth:`~neuroslam.cells.walls.WallMemory.evidence` has it.
+            evidence: Against and for the estimated position, of
+                :meth:`~neuroslam.cells.walls.WallMemory.evidence`.
             dt_s: Time since the last call.
         """
         self._make_room(int(winner.max()))
@@ -116,17 +116,17 @@ class Familiarity(BufferModule):
         new = (felt.near * ((ever @ self.slack) < _NEVER)).amax(-1)
         missing = ((always > _ALWAYS) * ((felt.any @ self.slack) == 0)).amax(-1)
         known = (time > _FAMILIAR_S) & (winner >= 0)
-        against, speaks_for = evidence
-        surprise = against | ((torch.maximum(new, missing) > 0) & known)
-        agrees = speaks_for & ~surprise
-        doubt = self.doubt_s + dt_s * (surprise.to(time) - _FORGIVES * agrees.to(time))
+        against, supports = evidence
+        contradicted = against | ((torch.maximum(new, missing) > 0) & known)
+        agrees = supports & ~contradicted
+        doubt = self.doubt_s + dt_s * (contradicted.to(time) - _FORGIVES * agrees.to(time))
         self.doubt_s = doubt.clamp(0.0, _MOST * self.lost_after_s)
         self.lost = torch.where(
             self.lost,
             self.doubt_s > 0.0,
             self.doubt_s > self.lost_after_s,
         )
-        sure = (~surprise & (winner >= 0) & ~self.lost).to(time) * dt_s
+        sure = (~contradicted & (winner >= 0) & ~self.lost).to(time) * dt_s
         self.time_s[rows, cell] = time + sure
         self.felt_s[rows, cell] += torch.stack(felt, dim=1) * sure[:, None, None]
         return self.lost
@@ -136,7 +136,7 @@ class Familiarity(BufferModule):
         return (self.felt_s[:, :, 0] > 0).sum((1, 2))
 
     def reset_doubt(self) -> None:
-        """Say that the position is known again."""
+        """Reset the doubt: the position is known again."""
         self.doubt_s, self.lost = torch.zeros_like(self.doubt_s), torch.zeros_like(self.lost)
 
     def _make_room(self, cell: int) -> None:

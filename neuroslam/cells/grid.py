@@ -11,6 +11,8 @@ from neuroslam.state.mergeable import BufferModule
 
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0
+_KEPT = 8
+_developed: dict[tuple[str, torch.dtype], dict[str, Tensor]] = {}
 
 
 class LAHNWeights(NamedTuple):
@@ -132,7 +134,19 @@ class LAHNGridCells(BufferModule):
         lead = () if batch is None else (batch,)
         self.register_buffer("rates", torch.zeros(*lead, m, n))
         self.register_buffer("generator_state", generator.get_state())
-        self.develop(config.development_steps)
+        self._develop_once()
+
+    def _develop_once(self) -> None:
+        """Develop; of one config a process works it out once, as each brain that is loaded asks."""
+        key = self.config.model_dump_json(), self.bias.dtype
+        if key in _developed:
+            self.load_state_dict({**self.state_dict(), **_developed[key]})
+            return
+        self.develop(self.config.development_steps)
+        while len(_developed) >= _KEPT:
+            _developed.pop(next(iter(_developed)))
+        learnt = (*LAHNWeights._fields, "generator_state")
+        _developed[key] = {name: self.state_dict()[name].clone() for name in learnt}
 
     @property
     def weights(self) -> LAHNWeights:

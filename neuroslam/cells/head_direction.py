@@ -1,7 +1,7 @@
-r"""Head-direction cells: a ring attractor that integrates turns and is held by compass and views.
+r"""Head-direction cells: a ring attractor that integrates turns, corrected by compass and views.
 
-One population in one file: its section of the config, its pure steps with their equations, the
-module, and what becomes of it when two sessions merge. The model is that of Skaggs et al. (1995,
+One population in one file: its config section, its pure steps with their equations, the module,
+and the merge of two sessions. The model is that of Skaggs et al. (1995,
 *Advances in Neural Information Processing Systems* 7) and Zhang (1996, *J. Neurosci.* 16: 2112).
 """
 
@@ -29,43 +29,79 @@ from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Frame, Motion, ViewMatch
 
 _RELAXATIONS = 400
-"""Full relaxations from a bump nearly right to one that no longer changes."""
+"""Relaxations after which the initial bump no longer changes."""
 
 
 class HeadDirectionConfig(Section):
     """Head-direction cells: a continuous attractor on a ring of directions."""
 
-    n: int = Field(120, ge=24, description="cells, evenly over the full turn")
+    n: int = Field(
+        default=120,
+        ge=24,
+        description="number of cells, preferred directions evenly over the full turn; larger: "
+        "slower, not more exact",
+    )
     excite_deg: float = Field(
-        30.0, ge=10, le=60, description="std of the excitation kernel; wider: broader tuning"
+        default=30.0,
+        ge=10,
+        le=60,
+        description="standard deviation of the excitation kernel; larger: broader tuning",
     )
     inhibition: float = Field(
-        0.3, ge=0.1, le=0.6, description="by all activity, a share of the strongest excitation"
+        default=0.3,
+        ge=0.1,
+        le=0.6,
+        description="inhibition by all other cells, as a share of the strongest excitation; "
+        "larger: narrower tuning",
     )
-    gain: float = Field(10.0, gt=0, description="of the response; larger: a sharper threshold")
-    exponent: float = Field(2.0, ge=1, description="of the response; larger: narrower tuning")
+    gain: float = Field(
+        default=10.0, gt=0, description="gain of the response function; larger: a sharper threshold"
+    )
+    exponent: float = Field(
+        default=2.0, ge=1, description="exponent of the response function; larger: narrower tuning"
+    )
     settle_s: float = Field(
-        2.0, gt=0, description="in which a weaker bump fades; longer: the stronger bump lasts"
+        default=2.0,
+        gt=0,
+        description="time constant in which the weaker of two bumps fades; larger: a cue needs "
+        "longer to win against the present heading",
     )
     compass_s: float = Field(
-        2.0, gt=0, description="in which a compass corrects; longer: its noise averages out"
+        default=2.0,
+        gt=0,
+        description="time constant in which a compass corrects the heading; larger: slower, "
+        "averages more noise",
     )
-    view_s: float = Field(0.5, gt=0, description="in which a known view corrects")
+    view_s: float = Field(
+        default=0.5,
+        gt=0,
+        description="time constant in which a known view corrects the heading; larger: slower",
+    )
     fatigue_s: float = Field(
-        0.5, gt=0, description="in which a view loses its effect that is seen on and on"
+        default=0.5,
+        gt=0,
+        description="time constant in which a view that stays in sight loses its effect; larger: "
+        "it corrects longer",
     )
-    inject_after: int = Field(10, ge=0, description="the newest so many views correct nothing")
-    precision: Literal["float32", "float64"] = Field("float64", description="of the activity")
+    inject_after: int = Field(
+        default=10,
+        ge=0,
+        description="number of newest views that never correct; larger: the robot must be away "
+        "longer before a view corrects the heading",
+    )
+    precision: Literal["float32", "float64"] = Field(
+        default="float64", description="number type of the activity"
+    )
 
 
 class Ring(NamedTuple):
-    r"""What follows from the config: kernels by their Fourier coefficients, and the settled bump.
+    r"""Constants of a config: kernels by their Fourier coefficients, and the settled bump.
 
     Attributes:
         order: :math:`k = 0 \dots n/2`, twice, shape ``(2 K,)``.
         quarter: :math:`\pi/2` for the even parts, 0 for the odd ones, ``(2 K,)``.
-        kernels: Even and odd parts of two kernels, ``(2 K, 2 n)``: one that only turns, and
-            excitation minus inhibition.
+        kernels: Even and odd parts of two kernels, ``(2 K, 2 n)``: one that only rotates,
+            and excitation minus inhibition.
         bump: Even and odd parts of the settled bump, ``(2 K, n)``.
         windows: Cosines and sines within a quarter turn of every cell, ``(n, 2, n)``.
         peak: Activity of the most active cell of a settled bump.
@@ -83,8 +119,8 @@ class Ring(NamedTuple):
     exponent: float
 
 
-class Heard(NamedTuple):
-    """What a frame has for head-direction cells: the heading measured by a compass, in radians."""
+class CompassReading(NamedTuple):
+    """Heading measured by a compass, in radians."""
 
     compass_rad: float
 
@@ -107,7 +143,7 @@ def turned_kernels(ring: Ring, turn_rad: float | Tensor) -> Tensor:
         turn_rad: :math:`\Delta`, a number or ``(...,)``.
 
     Returns:
-        Shape ``(..., 2, n)``: the kernel that only turns, and excitation minus inhibition.
+        Shape ``(..., 2, n)``: the kernel that only rotates, and excitation minus inhibition.
     """
     return (_waves(ring, turn_rad) @ ring.kernels).unflatten(-1, (2, -1))
 
@@ -124,12 +160,12 @@ def bump_at(ring: Ring, heading_rad: float | Tensor) -> Tensor:
 
 
 def respond(drive: Tensor, gain: float, exponent: float) -> Tensor:
-    r"""Turn input into activity of sum 1: a soft threshold, a power, divisive normalisation.
+    r"""Return activity of sum 1 for an input: soft threshold, power, divisive normalisation.
 
     .. math:: F(u)_i = \frac{\ln^\beta (1 + e^{b u_i})}{\sum_j \ln^\beta (1 + e^{b u_j})}
 
-    (The response function of Zhang 1996.) It is smooth, so that a bump lies between cells as well
-    as on them: a threshold with a corner would draw it to the cells.
+    (The response function of Zhang 1996.) It is smooth, so that bumps between cells are as
+    stable as bumps on cells; a threshold with a corner would attract them to cells.
 
     Args:
         drive: :math:`u`, excitation minus inhibition, shape ``(..., n)``.
@@ -148,7 +184,7 @@ def respond(drive: Tensor, gain: float, exponent: float) -> Tensor:
 def ring_step(
     activity: Tensor, turn_rad: float | Tensor, settle_share: float, ring: Ring
 ) -> Tensor:
-    r"""Turn the activity and let it settle: one step of the ring attractor.
+    r"""Rotate the activity and let it settle: one step of the ring attractor.
 
     .. math:: \tau \frac{\partial r}{\partial t} + \omega \frac{\partial r}{\partial \theta}
               = -r + F(w * r)
@@ -178,13 +214,14 @@ def ring_step(
 
 
 def inject(activity: Tensor, heading_rad: float | Tensor, share: float, ring: Ring) -> Tensor:
-    r"""Let a cue add a bump of activity at its direction, at the cost of all other activity.
+    r"""Mix a bump at the direction of a cue into the activity.
 
     .. math:: r \leftarrow (1 - g)\, r + g\, B(\theta - \theta_\text{cue}),
               \qquad g = 1 - e^{-dt/\tau_\text{cue}}
 
-    Near the bump, it moves by the share :math:`g` of the difference. Far from it a second bump
-    grows, which :func:`ring_step` weakens until it is the stronger one: then the heading jumps.
+    A cue near the bump moves it by the share :math:`g` of the difference. A cue far from it makes a
+    second bump grow; :func:`ring_step` weakens the smaller of the two, so that the heading jumps
+    once the second is larger.
 
     Args:
         activity: :math:`r`, shape ``(..., n)``, sum 1.
@@ -196,7 +233,7 @@ def inject(activity: Tensor, heading_rad: float | Tensor, share: float, ring: Ri
 
 
 def turned(activity: Tensor, turn_rad: float | Tensor) -> Tensor:
-    r"""Turn activity by any angle, exactly: :math:`\hat r_k \leftarrow \hat r_k e^{-ik\Delta}`.
+    r"""Rotate activity by any angle, exactly: :math:`\hat r_k \leftarrow \hat r_k e^{-ik\Delta}`.
 
     Args:
         activity: Shape ``(..., n)``.
@@ -214,13 +251,13 @@ def turned(activity: Tensor, turn_rad: float | Tensor) -> Tensor:
 
 
 def decode_heading(activity: Tensor, ring: Ring) -> Tensor:
-    r"""Find the direction of the dominant bump: the population vector around the peak.
+    r"""Return the direction of the dominant bump: the population vector around the peak.
 
     .. math:: \hat\theta = \operatorname{atan2}\Big(\sum_i r_i^2 \sin\theta_i,
               \sum_i r_i^2 \cos\theta_i\Big), \quad |\theta_i - \theta_\text{peak}| \le \pi/2
 
-    A second bump on the other side of the ring has no part in it. Squares, so that where the sum
-    ends does not matter: with :math:`r_i` the heading is off by some 0.0005 degrees.
+    A second bump on the other side of the ring does not count. With squares the ends of the sum do
+    not matter; with :math:`r_i` the error would be some 0.0005 degrees.
 
     Args:
         activity: Shape ``(..., n)``.
@@ -234,40 +271,8 @@ def decode_heading(activity: Tensor, ring: Ring) -> Tensor:
     return torch.atan2(y, x)
 
 
-def tuning_width(curve: np.ndarray, level: float = 0.5) -> float:
-    """Measure how wide a tuning curve is, in degrees, between where it crosses a level.
-
-    Args:
-        curve: Rates at directions evenly over the full turn, one peak, ``(n,)``.
-        level: Share of the peak, above the smallest rate; between 0 and 1.
-
-    Example:
-        >>> angle = np.arange(360) * np.pi / 180.0
-        >>> round(tuning_width(1.0 + np.cos(angle)), 6)
-        180.0
-    """
-    curve = np.asarray(curve, dtype=np.float64)
-    n = len(curve)
-    fine = np.fft.irfft(np.fft.rfft(curve), n=n * 64) * 64.0
-    middle = len(fine) // 2
-    fine = np.roll(fine, middle - int(fine.argmax()))
-    height = fine.min() + level * (fine.max() - fine.min())
-    below = np.flatnonzero(fine < height)  # the nearest to either side of the peak
-    left_of, right_of = below[below < middle], below[below > middle]
-    i = int(left_of[-1]) if len(left_of) else -1
-    j = int(right_of[0]) if len(right_of) else len(fine)
-    left, right = (
-        k
-        + step
-        * (height - fine[k % len(fine)])
-        / (fine[(k + step) % len(fine)] - fine[k % len(fine)])
-        for k, step in ((i, 1), (j, -1))
-    )
-    return float((right - left) * 360.0 / len(fine))
-
-
 def _waves(ring: Ring, angle_rad: float | Tensor) -> Tensor:
-    """Cosines, then sines, of the multiples of an angle, shape ``(..., 2 K)``."""
+    """Return cosines, then sines, of the multiples of an angle, shape ``(..., 2 K)``."""
     if isinstance(angle_rad, Tensor):
         angle = angle_rad.to(ring.order)[..., None]
         return torch.sin(ring.quarter + ring.order * angle)
@@ -278,10 +283,10 @@ def _waves(ring: Ring, angle_rad: float | Tensor) -> Tensor:
 @torch.inference_mode(mode=False)
 @torch.no_grad()
 def make_ring(config: HeadDirectionConfig) -> Ring:
-    r"""Make the kernels of a config and find the bump that they settle to.
+    r"""Compute the kernels of a config and the bump that they settle to.
 
     Excitation is a wrapped Gaussian, :math:`\hat w_k = e^{-k^2\sigma^2/2}`, scaled to a peak of 1;
-    inhibition is the same for all cells, so that the kernel is :math:`w - \varphi`.
+    inhibition :math:`\varphi` is uniform, so the kernel is :math:`w - \varphi`.
     """
     n, like = config.n, {"dtype": torch.float64}
     k = torch.arange(n // 2 + 1, **like)
@@ -301,7 +306,7 @@ def make_ring(config: HeadDirectionConfig) -> Ring:
     bump = torch.softmax(8.0 * angles.cos(), 0)
     for _ in range(_RELAXATIONS):
         bump = ring_step(bump, 0.0, 1.0, ring)
-    spectrum = torch.fft.rfft(bump).real  # even, as it was begun
+    spectrum = torch.fft.rfft(bump).real  # even, as at the start
     parts = [_parts(spectrum[None], angles, wave)[:, 0] for wave in (np.cos, np.sin)]
     dtype = getattr(torch, config.precision)
     tensors = (order, quarter, kernels, torch.cat(parts), windows)
@@ -314,7 +319,7 @@ def make_ring(config: HeadDirectionConfig) -> Ring:
 
 
 def _parts(coefficients: Tensor, angles: Tensor, wave: np.ufunc) -> Tensor:
-    """Even (cosine) or odd (sine) waves of each order, by coefficients: ``(K, kernels, n)``."""
+    """Return even (cosine) or odd (sine) waves times coefficients, ``(K, kernels, n)``."""
     n = len(angles)
     k = torch.arange(n // 2 + 1, dtype=angles.dtype)
     twice = torch.full_like(k, 2.0)
@@ -328,20 +333,31 @@ def _parts(coefficients: Tensor, angles: Tensor, wave: np.ufunc) -> Tensor:
 # ------------------------------------------------------------------------------------- module
 
 
+class LastView(Scalars):
+    """Last view, time for which it has been in sight, and whether a compass aligned the ring."""
+
+    view: int
+    seen_s: float
+    anchored: int
+
+    def __init__(self) -> None:
+        super().__init__(view=NO_TEMPLATE, seen_s=0.0, anchored=0)
+
+
 @register("head_direction")
 class HeadDirectionCells(Population):
-    """A bump of activity on a ring of cells is the heading; :func:`ring_step` has the equation.
+    """A bump of activity on a ring of cells encodes the heading; see :func:`ring_step`.
 
-    Turns move it, by exactly their angle. A compass and known views inject activity where they
-    say the heading is, and landmarks or other populations turn it (:meth:`follow`). The first
-    compass reading says how the ring lies in the world: before it, heading 0 is where the session
-    began. State: the activity, the heading at which every view was learnt (``views``), and the
-    last view and for how long it was seen (``last``).
+    A turn moves it by exactly its angle. A compass and known views inject activity at the heading
+    that they imply; corrections of landmarks or other populations rotate it (:meth:`follow`). The
+    first compass reading aligns the ring with the world; before it, heading 0 is that of the
+    start. State: the activity, the heading at which every view was learnt (``views``), and the
+    last view and the time for which it was in sight (``last``).
 
     Args:
-        config: Size, dynamics, and how strong the cues are.
+        config: Size, dynamics, and strength of the cues.
         batch: Number of animals side by side; ``None`` for one. A batch integrates turns and
-            hears a compass; it learns no views.
+            uses a compass; it learns no views.
 
     Example:
         >>> cells = HeadDirectionCells()
@@ -364,7 +380,7 @@ class HeadDirectionCells(Population):
         start = 0.0 if batch is None else torch.zeros(batch, dtype=torch.float64)
         self.register_buffer("activity", bump_at(self.ring, start))
         self.views = GrowingTable({"heading_rad": ((), torch.float64)})
-        self.last = Scalars(view=NO_TEMPLATE, seen_s=0.0, anchored=0)
+        self.last = LastView()
         self._decoded: tuple[Tensor | None, float | Tensor] = (None, 0.0)
         self.register_load_state_dict_post_hook(_forget_decoded)
 
@@ -384,16 +400,16 @@ class HeadDirectionCells(Population):
         return np.arange(self.config.n) * TWO_PI / self.config.n
 
     @without_gradients
-    def place(self, heading_rad: float | Tensor) -> None:
-        """Put a settled bump at a heading, and forget all other activity."""
+    def set_heading(self, heading_rad: float | Tensor) -> None:
+        """Replace all activity by a settled bump at a heading."""
         self.activity = bump_at(self.ring, heading_rad).expand_as(self.activity).contiguous()
 
     @without_gradients
-    def take(self, activity: Tensor) -> None:
-        """Take over activity of any shape, normalised to sum 1.
+    def set_activity(self, activity: Tensor) -> None:
+        """Replace the activity, normalised to sum 1.
 
         Raises:
-            MapError: If it has another size, is negative anywhere, or nothing is active.
+            MapError: If it has another shape, a negative cell, or no active one.
         """
         if activity.shape != self.activity.shape:
             raise MapError(
@@ -409,47 +425,47 @@ class HeadDirectionCells(Population):
         self.activity = activity / total
 
     @without_gradients
-    def advance(self, motion: Motion, heard: Heard | None = None) -> float:
-        """Turn by self-motion, settle, and let the compass correct.
+    def advance(self, motion: Motion, compass: CompassReading | None = None) -> float:
+        """Rotate by self-motion, settle, and correct by the compass.
 
         Args:
             motion: Turn rate in rad/s (in a batch ``(batch,)``) for how many seconds.
-            heard: What :meth:`observe` found.
+            compass: Reading of the compass; ``None``: none in this frame.
 
         Returns:
-            By how much the compass turned the heading, in radians; 0 in a batch.
+            Correction of the heading by the compass, in radians; 0 in a batch.
         """
         dt = motion.dt_s
         turn = motion.w_rad_s * dt
         share = -math.expm1(-dt / self.config.settle_s)
         self.activity = ring_step(self.activity, turn, share, self.ring)
-        if heard is None:
+        if compass is None:
             return 0.0
         if not self.last.anchored:
-            self._anchor(heard.compass_rad)
+            self._anchor(compass.compass_rad)
             return 0.0
-        return self.correct(heard.compass_rad, self.config.compass_s, dt)
+        return self.correct(compass.compass_rad, self.config.compass_s, dt)
 
     @without_gradients
     def correct(self, heading_rad: float | Tensor, time_s: float, dt_s: float) -> float:
-        """Inject activity at a heading, as strong as a cue that corrects within ``time_s``.
+        """Inject activity at a heading, so that it corrects with the time constant ``time_s``.
 
         Returns:
-            By how much the heading turned, in radians; 0 in a batch.
+            Correction of the heading, in radians; 0 in a batch.
         """
         share = -math.expm1(-dt_s / time_s)
         before = self.heading_rad if self.batch is None else 0.0
         self.activity = inject(self.activity, heading_rad, share, self.ring)
         return wrap_angle(self.heading_rad - before) if self.batch is None else 0.0
 
-    def see(self, view: ViewMatch, dt_s: float) -> float:
-        """Bind a new view to the heading; let a known one correct it.
+    def update_from_view(self, view: ViewMatch, dt_s: float) -> float:
+        """Bind a new view to the heading; correct the heading by a known one.
 
         Returns:
-            By how much the view turned the heading, in radians.
+            Correction of the heading, in radians.
 
         Raises:
-            MapError: If the view is new, but not the next, or known, but was never learnt.
+            MapError: If a new view is not the next, or a known one was never learnt.
         """
         if view.is_new:
             self.bind(view)
@@ -457,10 +473,11 @@ class HeadDirectionCells(Population):
 
     @without_gradients
     def correct_by_view(self, view: ViewMatch, dt_s: float) -> float:
-        r"""Let a known view correct the heading; returns by how much it turned, in radians.
+        r"""Correct the heading by a known view; return the correction in radians.
 
-        A view corrects within :math:`\tau_v e^{t/\tau_f}` after it has been seen for :math:`t`, so
-        that one that is still recognised while the animal turns does not hold it back.
+        After a time :math:`t` in sight a view corrects with the time constant
+        :math:`\tau_v e^{t/\tau_f}`, so that a view that still matches while the animal turns does
+        not hold the heading back.
         """
         now = self.last
         if view.template == NO_TEMPLATE:
@@ -478,14 +495,14 @@ class HeadDirectionCells(Population):
     def forward(
         self, motion: Motion, view: ViewMatch | None = None, compass_rad: float | None = None
     ) -> float | Tensor:
-        """Advance one frame: turn, settle, hear the compass, see the view; returns the heading."""
-        self.advance(motion, None if compass_rad is None else Heard(compass_rad))
+        """Advance one frame: rotate, settle, correct by compass and view; return the heading."""
+        self.advance(motion, None if compass_rad is None else CompassReading(compass_rad))
         if view is not None:
-            self.see(view, motion.dt_s)
+            self.update_from_view(view, motion.dt_s)
         return self.heading_rad
 
     def _anchor(self, compass_rad: float | Tensor) -> None:
-        """Turn the whole frame, learnt headings too, so that it is that of the compass."""
+        """Rotate activity and learnt headings into the frame of the compass."""
         if self.batch is not None:
             self.activity = turned(self.activity, compass_rad - self.heading_rad)
         else:
@@ -503,7 +520,7 @@ class HeadDirectionCells(Population):
 
     @without_gradients
     def turn_by(self, turn_rad: float) -> None:
-        """Turn the activity by an angle, exactly."""
+        """Rotate the activity by an angle, exactly."""
         self.activity = turned(self.activity, turn_rad)
 
     def bind(self, view: ViewMatch) -> None:
@@ -520,10 +537,10 @@ class HeadDirectionCells(Population):
         self.views.append(heading_rad=self.heading_rad)
 
     def turn_of(self, view: ViewMatch) -> float | None:
-        """Return by how much a view would have the heading turn; changes nothing.
+        """Return the heading difference that a view implies, without correcting it.
 
         Returns:
-            Radians in [-pi, pi); ``None`` for no view, or one of the newest.
+            Radians in [-pi, pi); ``None`` without a view, or for one of the newest.
 
         Raises:
             MapError: If the view was never learnt.
@@ -540,34 +557,36 @@ class HeadDirectionCells(Population):
         learnt = self.views["heading_rad"][view.template].item()
         return wrap_angle(learnt + view.relative_heading_rad - self.heading_rad)
 
-    # ------------------------------------------------------- its part in a brain of populations
+    # ------------------------------------------------------- protocol of a population
 
-    def observe(self, frame: Frame) -> Heard | None:
-        """Take the heading of the compass from a frame, if it has one.
+    def observe(self, frame: Frame) -> CompassReading | None:
+        """Return the compass reading of a frame, if it has one.
 
         Raises:
             BadFrame: If it is not a finite number.
         """
         if frame.heading_rad is None:
             return None
-        return Heard(checked_number(frame.heading_rad, "heading", "rad"))
+        return CompassReading(checked_number(frame.heading_rad, "heading", "rad"))
 
-    def step(self, now: StepInput, observation: Heard | None) -> Correction:
-        """Advance by a frame of the brain; all others turn as the compass has turned the ring."""
+    def step(self, now: StepInput, observation: CompassReading | None) -> Correction:
+        """Advance by a frame of the brain; return the correction of the heading by the compass."""
         return Correction(turn_rad=self.advance(now.motion, observation))
 
     def follow(self, correction: Correction) -> None:
-        """Turn as a landmark or another population has corrected the heading."""
+        """Rotate by the heading correction of a landmark or another population."""
         if correction.turn_rad:
             self.turn_by(correction.turn_rad)
 
-    def learn(self, now: StepInput, observation: Heard | None) -> None:
-        """Bind a new view to the present heading; a known one stays as it is."""
+    def learn(self, now: StepInput, observation: CompassReading | None) -> None:
+        """Bind a new view to the present heading."""
         if now.view.is_new:
             self.bind(now.view)
 
-    def recall(self, now: StepInput, observation: Heard | None, belief: Belief | None) -> None:
-        """Let a known view correct the ring; the map corrects its own heading by it already."""
+    def recall(
+        self, now: StepInput, observation: CompassReading | None, belief: Belief | None
+    ) -> None:
+        """Correct the ring by a known view; the map corrects its own heading itself."""
         self.correct_by_view(now.view, now.motion.dt_s)
 
     @property
@@ -576,11 +595,11 @@ class HeadDirectionCells(Population):
         return (self.activity / self.ring.peak).numpy(force=True)
 
     def counts(self) -> dict[str, float]:
-        """Return how many cells there are, and views that they know."""
+        """Return the number of cells and of known views."""
         return {"head_direction_cells": self.config.n, "head_direction_views": self.views.n}
 
     def scalars(self) -> dict[str, float]:
-        """Return the heading, and how much of the activity is in its bump."""
+        """Return the heading, and the share of activity in its bump."""
         if self.batch is not None:
             return {}
         bump = self.ring.windows[int(self.activity.argmax())] @ self.activity
@@ -603,7 +622,7 @@ class HeadDirectionCells(Population):
     def faults(
         cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
     ) -> Iterator[str]:
-        """Say where activity is no bump, or views are not those of the brain."""
+        """Yield activity that is not normalised, and views that are not those of the brain."""
         activity, views = state["activity"], state["views.heading_rad"]
         if (activity < 0).any():
             yield "head_direction.activity: negative"
@@ -615,10 +634,10 @@ class HeadDirectionCells(Population):
             yield f"head_direction.last.view: is {state['last.view']}, expected -1 to {n_views - 1}"
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
-        """Turn the partial session's bump and headings into the loaded frame; join the views.
+        """Rotate the partial session's bump and headings into the loaded frame; merge the views.
 
-        The frame is that of the compass, if either session heard one; :func:`frame_turn` says how
-        the frames lie. A view that both know keeps the heading of the loaded one.
+        The frame is that of the compass, if either session had one; :func:`frame_turn` has the
+        rotation. A view that both know keeps the heading of the loaded session.
         """
         turn = frame_turn(loaded, partial, join)
         onto_partial = bool(partial["last.anchored"]) and not bool(loaded["last.anchored"])
@@ -638,18 +657,18 @@ class HeadDirectionCells(Population):
 
 
 def _forget_decoded(cells: HeadDirectionCells, _keys: object) -> None:
-    cells._decoded = (None, 0.0)  # a state is copied into the very tensor that was decoded
+    cells._decoded = (None, 0.0)  # a state is copied into the same tensor
 
 
 def frame_turn(loaded: State, partial: State, join: Join) -> float:
-    r"""Say by how much headings of the partial session turn to be those of the loaded one.
+    r"""Return the rotation of the partial session's headings into the loaded frame.
 
-    Not at all, where both heard the compass. Else by the mean difference of the views both know,
+    It is 0 if both sessions had a compass; else the mean difference of the views that both know,
 
     .. math:: \Delta = \arg \sum_v e^{i(\theta_v - \theta'_v + \rho_v)}
 
-    with :math:`\rho_v` the heading with which the partial view was learnt minus that of the merged
-    one; and where there is none such, as the cells turn.
+    with :math:`\rho_v` the heading at which the partial view was learnt minus that of the merged
+    one; without such views it is the rotation of the cells.
     """
     if int(loaded["last.anchored"]) and int(partial["last.anchored"]):
         return 0.0

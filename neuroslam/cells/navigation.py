@@ -1,21 +1,22 @@
-"""SLRB: boundary cells, grid cells and place cells composed; motion and walls in, a place out."""
+"""SLRB: boundary, grid and place cells that localise an animal by self-motion and walls."""
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple, Self
+from collections.abc import Callable, Iterator, Mapping
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.cells.boundary import BoundaryCells, check_walls, checked_walls
+from neuroslam.cells.boundary import BoundaryCells, check_motion, check_walls, checked_walls
 from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.joining import join_navigation, navigation_faults, view_frames
+from neuroslam.cells.navigation_state import NavigationEstimate, NavigationState
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.wall_matching import match_walls, outline_of
-from neuroslam.cells.walls import WallMemory, check_motion
+from neuroslam.cells.walls import WallMemory
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
@@ -34,7 +35,7 @@ from neuroslam.state.population import (
     StepInput,
 )
 from neuroslam.state.registry import leading_class, register
-from neuroslam.state.tables import GrowingTable, Scalars
+from neuroslam.state.tables import GrowingTable
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,
@@ -46,38 +47,20 @@ from neuroslam.types import (
 )
 
 FAMILIARITY_PERIOD_S = 0.5
-"""Time between looks at whether a place is what it was."""
-
-
-class NavigationEstimate(NamedTuple):
-    """What the navigation cells say after a step.
-
-    Attributes:
-        position_m: Position since the start, ``([batch,] 2)``.
-        correction_m: By how much walls corrected it just now, ``([batch,] 2)``.
-        place: Number of the place cell that wins, ``([batch])``.
-        recruited: Whether that cell is new.
-        lost: Whether walls contradict what is known of the place, ``([batch])``.
-    """
-
-    position_m: Tensor
-    correction_m: Tensor
-    place: Tensor
-    recruited: Tensor
-    lost: Tensor
+"""Time between two comparisons of the walls with those known at the place cell."""
 
 
 @register("place")
 class NavigationCells(Population):
-    """Boundary, grid and place cells of an animal that knows its motion and the walls around.
+    """Boundary, grid and place cells of an animal that senses its motion and the walls around.
 
-    Self-motion turns the oscillators' phases, whose pattern the grid cells tell; walls correct the
-    phases of all modules by one displacement; place cells compete for the grid's pattern. Who is
-    lost goes on by self-motion, and learns nothing until it knows where it is.
+    Self-motion advances the phases of oscillators, which drive the grid cells; walls correct the
+    phases of all modules by one displacement; place cells compete for the pattern of the grid
+    cells. A lost animal continues by path integration, and does not learn until it relocalises.
 
-    Steps run in inference mode: gradients go through the parts, not through the whole. Animals of
-    a batch look at walls, and let their place cells compete, at the same instants; so one of them
-    does not live bit for bit as it would alone.
+    Steps run in inference mode: gradients flow through the parts, not through the whole. All
+    animals of a batch are corrected, and their place cells compete, at the same instants; so an
+    animal of a batch is not bit-equal to the same animal alone.
 
     Args:
         config: Of the brain; the sections ``boundary_cells``, ``grid_cells``, ``place_cells`` and
@@ -91,6 +74,8 @@ class NavigationCells(Population):
         >>> [round(x, 6) for x in here.position_m.tolist()], here.place.item()
         ([0.1, 0.0], 0)
     """
+
+    __call__: Callable[..., NavigationEstimate]
 
     name = "navigation"
     merge_sections = ("boundary_cells", "grid_cells", "place_cells")
@@ -117,19 +102,8 @@ class NavigationCells(Population):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
-        self.now = Scalars(
-            since_s=0.0,
-            someone_lost=0,
-            lost_s=0.0,  # animals times seconds
-            heading_rad=math.radians(config.map.initial_heading_deg),
-            compass=0,
-            turned_rad=0.0,  # of the compass, since the map was turned in a merge
-            last_view=NO_TEMPLATE,
-            views_agree=0,  # that the animal is off by so much
-            off_x_m=0.0,
-            off_y_m=0.0,
-        )
-        # Where each view was learnt; 0 in `sure` where the animal did not know.
+        self.now = NavigationState(config.map.initial_heading_deg)
+        # Pose at which each view was learnt; ``sure`` is 0 if the animal was lost.
         self.seen = GrowingTable(
             {name: ((), torch.float64) for name in ("x_m", "y_m", "heading_rad", "sure")}
         )
@@ -145,16 +119,16 @@ class NavigationCells(Population):
         *,
         compass: bool = True,
     ) -> NavigationEstimate:
-        """Take in a step of motion and the walls at its end.
+        """Advance by one step of motion, and correct by the walls at its end.
 
         Args:
             speed_m_s: Measured speed, ``([batch])``.
             heading_rad: Measured heading in the world, ``([batch])``.
-            dt_s: For how long.
+            dt_s: Duration of the step.
             wall_m: Distance to the foot of the perpendicular on each wall,
                 ``([batch,] n_walls)``, nearest first; ``inf`` where there is none.
             wall_bearing_rad: Its bearing relative to the heading, the same shape.
-            compass: The heading is measured; else it is integrated from turns.
+            compass: Whether the heading is measured; else it is integrated from turn rates.
 
         Raises:
             BadFrame: If a number is not finite or a distance negative; nothing has changed then.
@@ -162,7 +136,7 @@ class NavigationCells(Population):
         if wall_m.shape != wall_bearing_rad.shape:
             check_walls(wall_m, wall_bearing_rad)
         if not 0.0 <= dt_s < math.inf:  # NaN too
-            raise BadFrame(f"time since the last step is {dt_s:g} s; expected 0 or more")
+            raise BadFrame(f"time since the last step is {dt_s} s; expected 0 or more")
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -180,7 +154,9 @@ class NavigationCells(Population):
         correction = torch.zeros_like(step)
         if nearest < math.inf and memory.is_due and self.config.wall_memory.corrects:
             believed = oscillators.decode() + step
-            correction = memory.look(believed, wall_m, bearing, compass=compass, learns=learns)
+            correction = memory.update_from_walls(
+                believed, wall_m, bearing, compass=compass, learns=learns
+            )
             step = step + correction
         grid = self.grid(oscillators.shift(step))
         place = self.place(grid.flatten(-2), oscillators.position_m, dt_s, learns=learns)
@@ -192,7 +168,7 @@ class NavigationCells(Population):
             sure_m = SURE * self.config.boundary_cells.reach_m
             evidence = memory.evidence(x, felt_m, felt_rad, sure_m)
             lost = self.familiarity(self.place.winner, felt_m, felt_rad, evidence, now.since_s)
-            if not self.config.wall_memory.corrects:  # walls are only felt: they contradict nothing
+            if not self.config.wall_memory.corrects:  # walls that do not correct do not contradict
                 self.familiarity.reset_doubt()
                 lost = self.familiarity.lost
             now.lost_s += now.since_s * int(lost.sum())
@@ -206,10 +182,10 @@ class NavigationCells(Population):
         )
 
     def observe(self, frame: Frame) -> np.ndarray | None:
-        """Return the walls of a frame, ``(n, 2)``, measured or found in its ranges.
+        """Return the walls of a frame, ``(n, 2)``: as measured, or found in its ranges.
 
         Raises:
-            BadFrame: If walls or ranges cannot be that.
+            BadFrame: If walls or ranges are invalid.
         """
         if frame.walls is not None:
             return checked_walls(frame.walls)
@@ -218,7 +194,7 @@ class NavigationCells(Population):
         return None
 
     def step(self, now: StepInput, observation: np.ndarray | None) -> Correction:
-        """Advance by a frame of the brain; return what walls corrected of position and heading."""
+        """Advance by a frame of the brain; return the walls' correction of position and heading."""
         error = self.heading_error_rad
         self._estimate = self.advance(now.motion, now.compass_rad, observation)
         dx, dy = self._estimate.correction_m.tolist()
@@ -227,7 +203,7 @@ class NavigationCells(Population):
     def advance(
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
     ) -> NavigationEstimate:
-        """Advance one animal by a frame; :meth:`forward` with what a frame has.
+        """Advance one animal by a frame; see :meth:`forward`.
 
         Args:
             motion: Since the last frame.
@@ -235,16 +211,13 @@ class NavigationCells(Population):
             walls: Distance (m) and bearing relative to the heading (rad) of each, ``(n, 2)``.
 
         Raises:
-            BadFrame: If a number cannot be; nothing has changed then.
+            BadFrame: If a number is invalid; nothing has changed then.
         """
         now, compass = self.now, compass_rad is not None
-        if compass:
-            compass_rad = checked_number(compass_rad, "heading", "rad")
-        heading = (
-            wrap_angle(compass_rad + now.turned_rad)
-            if compass
-            else wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
-        )
+        if compass_rad is not None:
+            heading = wrap_angle(checked_number(compass_rad, "heading", "rad") + now.turned_rad)
+        else:
+            heading = wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
         felt = torch.empty((0, 2), dtype=torch.float64)
         if walls is not None:
             felt = torch.from_numpy(checked_walls(walls).copy())
@@ -258,12 +231,12 @@ class NavigationCells(Population):
 
     @property
     def heading_error_rad(self) -> float:
-        """What was learnt of the heading's error, of one animal; it is taken off."""
+        """Learnt error of the measured heading of one animal, which is subtracted from it."""
         return self.walls.errors[0, 1].item()
 
     @property
     def pose(self) -> Pose:
-        """Position and heading of one animal, with what was learnt of the heading's error."""
+        """Position and heading of one animal, corrected by the learnt error of the heading."""
         x, y = self.oscillators.position_m.tolist()
         return Pose(x, y, wrap_angle(self.now.heading_rad - self.heading_error_rad))
 
@@ -275,11 +248,11 @@ class NavigationCells(Population):
 
     @property
     def lost(self) -> bool:
-        """Whether walls contradict what is known of the place, since the last frame."""
+        """Whether the animal is lost, as of the last frame."""
         return self._estimate is not None and bool(self._estimate.lost)
 
     def vetoes(self, view: ViewMatch) -> bool:
-        """Say whether a known view was learnt where the animal cannot be, as it believes."""
+        """Return whether a matched view was learnt implausibly far from the estimated position."""
         if view.is_new or view.template == NO_TEMPLATE or not self.seen["sure"][view.template]:
             return False
         x, y = self.seen["x_m"][view.template].item(), self.seen["y_m"][view.template].item()
@@ -291,13 +264,13 @@ class NavigationCells(Population):
         return 3.0 * self.config.wall_memory.view_sigma_m
 
     def learn(self, now: StepInput, observation: Observation) -> None:
-        """Learn where a view is, or be corrected by it; see :meth:`update_from_view`."""
+        """Store the position of a new view, or correct by a known one."""
         self.update_from_view(now.view)
 
     def follow(self, correction: Correction) -> None:
-        """Be corrected by a landmark, or go where a kidnapped robot has found itself.
+        """Correct by a landmark, or go to the pose at which a kidnapped robot was relocalised.
 
-        Small corrections of a map do not move the cells: their own walls are more accurate.
+        Small corrections of the map do not move the cells: walls are more accurate.
         """
         here, position = self.pose, correction.position_m
         if correction.relocalises:
@@ -313,7 +286,7 @@ class NavigationCells(Population):
         return Belief(self.pose, self.variance_m2)
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
-        """Go to the experience of the place cell that wins; each place cell is one."""
+        """Go to the experience of the winning place cell; each place cell is an experience."""
         winner = NO_EXPERIENCE
         if self._estimate is not None and not self.lost:
             winner = int(self._estimate.place)
@@ -321,16 +294,16 @@ class NavigationCells(Population):
 
     @without_gradients
     def update_from_view(self, view: ViewMatch) -> bool:
-        """Learn where a new view is, or be corrected by where a known one was learnt.
+        """Store the position of a new view, or correct by that of a known one.
 
-        A view near where it was learnt corrects the position a little. Where several views in a row
-        agree that the animal is somewhere else, it was kidnapped, or lost: it goes there.
+        A view learnt near the estimated position corrects it slightly. If several views in a row
+        agree on another position, the animal was kidnapped or is lost: it relocalises there.
 
         Returns:
-            Whether it did.
+            Whether the animal relocalised.
         """
         now = self.now
-        if view.template == NO_TEMPLATE:  # no picture at this instant: the last view still counts
+        if view.template == NO_TEMPLATE:  # no image in this frame: the last view still counts
             return False
         here = self.pose
         if view.is_new:
@@ -362,9 +335,9 @@ class NavigationCells(Population):
         return True
 
     def remembered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what one animal knows: places ``(n, 2)``, links ``(m, 2)``, walls ``(w, 2)``.
+        """Return centres of place cells ``(n, 2)``, links ``(m, 2)``, and walls ``(w, 2)``.
 
-        A stretch of wall is where the perpendicular from where it was seen meets it.
+        A stretch of wall is given by the foot of the perpendicular from its anchor.
         """
         centres, links = (part.numpy(force=True) for part in self.place.graph())
         columns = self.walls.remembered()[0][:4]
@@ -374,29 +347,29 @@ class NavigationCells(Population):
 
     @property
     def variance_m2(self) -> float:
-        """How sure one animal is of its position: the mean variance of x and y."""
+        """Mean variance of x and y of the position of one animal."""
         return 0.5 * self.walls.expected_variance_m2[0].trace().item()
 
     @without_gradients
     def update_from_landmark(
         self, place_m: tuple[float, float], sigma_m: float, variance_m2: float
     ) -> bool:
-        r"""Be corrected by where a known landmark puts one animal.
+        r"""Correct one animal by the position that a known landmark implies.
 
-        A landmark makes no one surer than who learnt it was: its error is taken to be the
-        :math:`R` with which the variance :math:`P` of the position becomes just that,
+        A landmark cannot make the position surer than it was when the landmark was learnt: the
+        variance :math:`R` of its measurement is such that :math:`P` becomes just that,
 
         .. math:: R = \frac{P (P_0 + \sigma^2)}{P - (P_0 + \sigma^2)}
 
-        so that looking again at what was learnt a moment ago tells nothing.
+        so that a landmark learnt a moment ago does not correct.
 
         Args:
-            place_m: Where that is.
-            sigma_m: Error of it.
-            variance_m2: Of the position when the landmark was learnt, :math:`P_0`.
+            place_m: Position that the landmark implies.
+            sigma_m: Standard deviation :math:`\sigma` of it.
+            variance_m2: Variance :math:`P_0` of the position when the landmark was learnt.
 
         Returns:
-            Whether it was near enough to be believed.
+            Whether the landmark passed the gate.
         """
         here, then = self.oscillators.position_m, variance_m2 + sigma_m**2
         variance = self.variance_m2
@@ -412,17 +385,17 @@ class NavigationCells(Population):
 
     @without_gradients
     def relocalise(self, pose: Pose, sigma_m: float) -> None:
-        """Set pose and phases of one animal anew; what it remembers stays.
+        """Set pose and phases of one animal; its memory stays.
 
         Args:
-            pose: Where it is; a measured heading is kept.
-            sigma_m: How sure that is.
+            pose: Pose of the animal; a measured heading is kept.
+            sigma_m: Standard deviation of the position.
         """
         now = self.now
         self.oscillators.place_at(self.oscillators.position_m.new_tensor([pose.x_m, pose.y_m]))
         now.heading_rad = wrap_angle(pose.theta_rad + self.heading_error_rad)
         self.walls.forget_position(sigma_m)
-        self.place.leave()
+        self.place.forget_winner()
         self.familiarity.reset_doubt()
         now.someone_lost = now.views_agree = 0
 
@@ -433,7 +406,7 @@ class NavigationCells(Population):
         return np.concatenate([part.flatten().numpy(force=True) for part in parts])
 
     def counts(self) -> dict[str, float]:
-        """Return the numbers of what one animal has learnt, and for how long it was lost."""
+        """Return how much one animal has learnt, and for how long it was lost."""
         return {
             "place_cells": int(self.place.n_cells),
             "walls": int(self.walls.n_walls),
@@ -442,7 +415,7 @@ class NavigationCells(Population):
         }
 
     def scalars(self) -> dict[str, float]:
-        """Return what TensorBoard shows of one animal."""
+        """Return the TensorBoard curves of one animal."""
         return {
             "cells/place_cells": float(self.place.n_cells),
             "cells/walls": float(self.walls.n_walls),
@@ -455,24 +428,27 @@ class NavigationCells(Population):
     def faults(
         cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
     ) -> Iterator[str]:
-        """Say where place cells, their links or walls are not there."""
+        """Yield references to place cells, links or walls that do not exist."""
         yield from navigation_faults(state, n_experiences if leading_class(config) is cls else None)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
-        """Join places, walls and views of two sessions in the frame of the loaded one."""
+        """Merge place cells, walls and views of two sessions in the frame of the loaded one."""
         return join_navigation(loaded, partial, join)
 
     def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
-        """Say how the sessions' frames lie by the views that both know."""
+        """Align the frames of two sessions by the views that both know."""
         return view_frames(loaded, partial, join)
 
     def match(
         self, loaded: "Population", maps: tuple[np.ndarray, np.ndarray], config: BrainConfig
     ) -> tuple[Match | None, str]:
-        """Align the walls that two sessions remember."""
+        """Find the alignment of two maps by the walls of both sessions."""
         if not isinstance(loaded, NavigationCells):
-            raise TypeError(f"NavigationCells: cannot be matched with {type(loaded).__name__}")
+            raise TypeError(
+                f"NavigationCells: cannot be matched with {type(loaded).__name__}; "
+                "expected NavigationCells"
+            )
         both = loaded, self
         compass = all(cells.now.compass for cells in both)
-        outlines = tuple(outline_of(*cells.walls.remembered()[0][:4]) for cells in both)
-        return match_walls(outlines, maps, config, compass=compass)
+        one, other = (outline_of(*cells.walls.remembered()[0][:4]) for cells in both)
+        return match_walls((one, other), maps, config, compass=compass)

@@ -1,6 +1,6 @@
-"""Place cells: a competitive Hebbian network on grid cells, which recruits cells as it explores."""
+"""Place cells: a competitive Hebbian network on grid cells that recruits cells as it explores."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -10,26 +10,26 @@ from neuroslam.state.mergeable import BufferModule, without_gradients
 from neuroslam.state.tables import Scalars
 
 NEIGHBOURS = 12
-"""Links of a place cell to others that were active before or after it, at most."""
+"""Largest number of links of a place cell to those that won before or after it."""
 
-_WINDOW = 32  # nearest cells, among which the winner is
-_SLACK_M = 0.06  # the animal may move so far before the window is looked up anew
-_STILL = 1 / 4  # of the distance between cells; who moved less has the same winner
-_ROOM = 64  # cells that a table begins with
+_WINDOW = 32  # nearest cells, which compete
+_SLACK_M = 0.06  # displacement after which the window is looked up again
+_STILL = 1 / 4  # share of threshold_m below which a displacement keeps the winner
+_ROOM = 64  # initial capacity of a table
 _NO_CELL = -1
 FAR_M = 1e6
-"""Where a cell lies that there is none of."""
+"""Coordinate of the centres of unused rows."""
 
 EMPTY = {"weights": 0.0, "centres_m": FAR_M, "visits": 0, "time_s": 0.0, "neighbours": _NO_CELL}
-"""Columns of the table of cells, and what stands where there is none."""
+"""Columns of the table of cells, and the values of unused rows."""
 
 
 class PlaceResponse(NamedTuple):
-    """What the place cells say.
+    """Result of the competition of place cells.
 
     Attributes:
-        winner: Number of the cell that wins, ``([batch])``; -1 while there is none.
-        recruited: Whether it was recruited just now.
+        winner: Number of the winning cell, ``([batch])``; -1 while there is none.
+        recruited: Whether it was recruited in this step.
         changed: Whether another cell won before.
     """
 
@@ -46,8 +46,7 @@ def place_response(
     .. math:: p_j = [\mathbf w_j \cdot \hat{\mathbf g}]_+^a
               \exp\!\Big(-\frac{|X_j - x|^2}{2\sigma^2}\Big)
 
-    The second factor keeps a place from being taken for another, farther one with the same phases
-    of the grid (SLRB, Algorithm 1, has none).
+    The second factor excludes far cells with a similar grid pattern (SLRB, Algorithm 1, has none).
 
     Args:
         weights: :math:`\mathbf w_j`, unit vectors, ``(..., n, n_grid)``.
@@ -59,12 +58,12 @@ def place_response(
     Returns:
         ``(..., n)``, from 0 to 1.
     """
-    alike = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0)
-    return alike.pow(power) * (away_m2 * (-0.5 / continuity_m**2)).exp()
+    similarity = (weights @ grid.unsqueeze(-1)).squeeze(-1).clamp_min(0.0)
+    return similarity.pow(power) * (away_m2 * (-0.5 / continuity_m**2)).exp()
 
 
 def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
-    r"""Move the winner's weights towards the pattern that it won with.
+    r"""Move the winner's weights towards the grid pattern.
 
     .. math:: \mathbf w \leftarrow \frac{\mathbf w + \eta(\hat{\mathbf g} - \mathbf w)}{|\cdot|}
 
@@ -76,13 +75,22 @@ def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
     return torch.nn.functional.normalize(torch.lerp(weights, grid, rate), dim=-1)
 
 
+class Stay(Scalars):
+    """Time for which the present winners have not changed."""
+
+    stay_s: float
+
+    def __init__(self) -> None:
+        super().__init__(stay_s=0.0)
+
+
 class CompetitiveHebbianPlaceCells(BufferModule):
-    """Place cells that compete for the patterns of grid cells; a new one is recruited far from all.
+    """Place cells that compete for patterns of grid cells; a new one is recruited far from others.
 
     :func:`place_response` and :func:`hebbian_step` have the mathematics. The winner is found among
     the nearest cells: beyond them the response is bounded by the distance alone. State: for every
-    cell its ``weights``, ``centres_m``, ``visits``, ``time_s`` and ``neighbours`` (the graph of
-    places: cells that won one after the other), and the window of nearest cells.
+    cell its ``weights``, ``centres_m``, ``visits``, ``time_s`` and ``neighbours`` (the graph:
+    cells that won one after the other), and the window of nearest cells.
 
     Args:
         config: Distance between cells, power, learning.
@@ -123,12 +131,12 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         self.register_buffer("neighbours", none)
         self.register_buffer("winner", torch.full((b,), _NO_CELL, dtype=torch.int64))
         self.register_buffer("window", torch.arange(_WINDOW).repeat(b, 1))
-        # Where the cells competed last, and where the window was looked up.
+        # Positions of the last competition, and of the last look-up of the window.
         self.register_buffer("landmarks_m", torch.full((2, b, 2), FAR_M, dtype=torch.float64))
         leash = torch.tensor([[_STILL * config.threshold_m], [_SLACK_M]], dtype=torch.float64)
         self.register_buffer("leash_m2", leash.square(), persistent=False)
         self.register_buffer("threshold_m", torch.tensor(config.threshold_m, dtype=torch.float64))
-        self.now = Scalars(stay_s=0.0)
+        self.now = Stay()
         self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
         self.register_state_dict_pre_hook(lambda module, *_: module._write_back())
         self.register_load_state_dict_pre_hook(_take_capacity)
@@ -136,7 +144,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
 
     @property
     def capacity(self) -> int:
-        """Cells there is room for before the tables grow."""
+        """Number of cells that the tables can hold before they grow."""
         return self.weights.shape[1]
 
     def _forget_window(self) -> None:
@@ -148,15 +156,15 @@ class CompetitiveHebbianPlaceCells(BufferModule):
     ) -> PlaceResponse:
         """Let the cells compete; recruit one where none is near, and let the winner learn.
 
-        Nothing is done while all animals are within a quarter of ``threshold_m`` of where the cells
-        competed last: who stands still has the same winner, and it is not taught the same again.
+        Nothing is done while all animals are within a quarter of ``threshold_m`` of the last
+        competition: the winner stays, and does not learn the same pattern again.
 
         Args:
             grid: Rates of the grid cells, ``([batch,] n_grid)``.
-            position_m: Position that the phases of the grid tell, ``([batch,] 2)``.
+            position_m: Position decoded from the phases of the oscillators, ``([batch,] 2)``.
             dt_s: Time since the last step.
-            learns: Who recruits and learns, ``(batch or 1,)``; the others only respond. ``None``:
-                all.
+            learns: Which animals recruit and learn, ``(batch or 1,)``; the others only respond.
+                ``None``: all.
         """
         one = self.batch is None
         position = (position_m[None] if one else position_m).detach().to(self.centres_m)
@@ -167,8 +175,8 @@ class CompetitiveHebbianPlaceCells(BufferModule):
             self._credit(self.winner, learns * dt_s)
         if not competes:
             self.now.stay_s += dt_s if learns is None else 0.0
-            nobody = torch.zeros_like(self.winner, dtype=torch.bool)
-            return self._response(nobody, nobody)
+            none = torch.zeros_like(self.winner, dtype=torch.bool)
+            return self._response(none, none)
         grid = (grid[None] if one else grid).detach().to(self.weights)
         grid = torch.nn.functional.normalize(grid, dim=-1)
         weights, centres = self._nearest(position, moved[1] if leaves_window else None)
@@ -182,7 +190,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         if bool(recruited.any()):
             slot = self._recruit(recruited, grid, position, slot, away)
         winner = self.window.gather(1, slot[:, None])[:, 0]
-        if learns is not None:  # who is lost from the start has no cell
+        if learns is not None:  # an animal lost from the start has no cell
             winner = winner.where(self.n_cells > 0, _NO_CELL)
         if c.hebbian_rate:
             self._learn(grid, slot, learns)
@@ -221,13 +229,13 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         return response[0] if one else response
 
     def centre_of(self, cells: Tensor) -> Tensor:
-        """Return where cells lie, ``([batch,] 2)``, for one cell of each animal."""
+        """Return the centre of one cell of each animal, ``([batch,] 2)``."""
         at = cells.reshape(-1, 1, 1).expand(-1, 1, 2)
         centres = self.centres_m.gather(1, at)[:, 0]
         return centres[0] if self.batch is None else centres
 
     def graph(self, animal: int = 0) -> tuple[Tensor, Tensor]:
-        """Return the graph of places: centres ``(n, 2)`` and links ``(m, 2)``, each once."""
+        """Return the graph of place cells: centres ``(n, 2)`` and links ``(m, 2)``, each once."""
         n = int(self.n_cells[animal])
         neighbours = self.neighbours[animal, :n]
         start, slot = (neighbours >= 0).nonzero(as_tuple=True)
@@ -259,7 +267,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
     def _recruit(
         self, recruited: Tensor, grid: Tensor, position: Tensor, slot: Tensor, away: Tensor
     ) -> Tensor:
-        """Add a cell for each animal that needs one; returns the slots of the winners."""
+        """Add a cell for each animal that needs one; return the slots of the winners."""
         rows = recruited.nonzero()[:, 0]
         new = self.n_cells[rows]
         if int(new.max()) >= self.capacity:
@@ -267,7 +275,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         self.weights[rows, new] = grid[rows]
         self.centres_m[rows, new] = position[rows]
         self.n_cells = self.n_cells + recruited.long()
-        # The newcomer takes the place of the farthest in the window, or it is in there already.
+        # The new cell replaces the farthest in the window, unless it is there already.
         is_in = self.window[rows] == new.unsqueeze(1)
         at = torch.where(is_in.any(1), is_in.long().argmax(1), away[rows].argmax(1))
         self._write_back(rows)  # before another cell takes the slot
@@ -277,7 +285,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         return slot.index_put((rows,), at)
 
     def _learn(self, grid: Tensor, slot: Tensor, learns: Tensor | None) -> None:
-        """Let the winners learn, in the window; the table has it when the window moves on."""
+        """Let the winners learn in the window; :meth:`_write_back` copies it to the table."""
         near = self._near[0]
         at = slot[:, None, None].expand(-1, 1, near.shape[-1])
         before = near.gather(1, at)
@@ -288,26 +296,26 @@ class CompetitiveHebbianPlaceCells(BufferModule):
 
     @without_gradients
     def _write_back(self, rows: Tensor | None = None) -> None:
-        """Bring what was learnt in the windows, of some animals or all, into the table."""
+        """Copy the weights of the windows, of some animals or all, to the table."""
         if self._near is None:
             return
         if rows is None:
             rows = torch.arange(len(self.window), device=self.window.device)
         self.weights[rows.unsqueeze(1), self.window[rows]] = self._near[0][rows]
 
-    def _apply(self, fn: object, recurse: bool = True) -> "CompetitiveHebbianPlaceCells":
+    def _apply(self, fn: Any, recurse: bool = True) -> Self:  # noqa: ANN401 - as nn.Module has it
         self._write_back()
         self._near = None
         return super()._apply(fn, recurse)
 
-    def leave(self) -> None:
-        """Say that the animal is elsewhere all at once: its next place is no neighbour."""
+    def forget_winner(self) -> None:
+        """Forget the winner, as after relocalisation: the next one is not linked to it."""
         self._flush_time()
         self.winner = torch.full_like(self.winner, _NO_CELL)
         self.landmarks_m = torch.full_like(self.landmarks_m, FAR_M)
 
     def _flush_time(self) -> None:
-        """Credit the time since the winners last changed to them."""
+        """Add the time since the last change of winners to their times."""
         if self.now.stay_s:
             self._credit(
                 self.winner, torch.full_like(self.winner, self.now.stay_s, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Pose cells: a belief over x, y and heading that follows odometry and is corrected by views."""
+"""Pose cells: an attractor over x, y and heading, moved by odometry and corrected by views."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -33,7 +33,7 @@ from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
 SATURATED_DECAY = math.log(30.0) / 1.2
-"""Decay at which a view injects nothing any more."""
+"""Fatigue from which on a view does not inject."""
 
 _SUM_TOLERANCE = {"float32": 1e-4, "float64": 1e-9}
 
@@ -41,8 +41,8 @@ _SUM_TOLERANCE = {"float32": 1e-4, "float64": 1e-9}
 @dataclass
 class _Now:
     packet: Packet
-    slip: list[float] | Tensor  # cells by which the estimate is behind odometry: x, y, theta
-    estimate: PoseEstimate | Tensor | None = None  # of the packet, when it was asked for
+    slip: list[float] | Tensor  # lag of the estimate behind odometry in cells: x, y, theta
+    estimate: PoseEstimate | Tensor | None = None  # of the packet, once it was decoded
     injected: bool = False  # since the last step
 
 
@@ -52,7 +52,7 @@ def _no_slip(like: Tensor) -> list[float] | Tensor:
 
 @register("pose")
 class PoseCellNetwork(Population):
-    """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet is the pose belief.
+    """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet encodes the pose.
 
     :func:`~neuroslam.cells.attractor.settle` and
     :func:`~neuroslam.cells.attractor.path_integrate` have the mathematics. The state is the
@@ -61,8 +61,8 @@ class PoseCellNetwork(Population):
 
     Args:
         config: Size and dynamics.
-        batch: Number of brains side by side; ``None`` for one. A batch integrates motion; it is
-            corrected by setting or adding to ``activity``, and it binds no views.
+        batch: Number of brains side by side; ``None`` for one. A batch integrates motion and
+            binds no views; correct it by setting ``activity``.
 
     Example:
         >>> cells = PoseCellNetwork(PoseCellConfig(cell_size_m=0.5))
@@ -102,7 +102,7 @@ class PoseCellNetwork(Population):
         slip = torch.zeros(*brains, 3, dtype=torch.float64)
         self.register_buffer("slip", slip)
         self._couplings: dict[tuple[int, int, int], Couplings] = {}
-        # In use the state is here, not in the buffers: those would cost more than the cells do.
+        # The state in use is here: writing buffers in each step would cost more than the cells.
         self._now = _Now(Packet(self.window, (0, 0, 0), self.shape), slip)
         self.register_state_dict_pre_hook(lambda module, *_: module._write_buffers())
         self.register_load_state_dict_pre_hook(_take_window_size)
@@ -110,7 +110,7 @@ class PoseCellNetwork(Population):
         self.reset()
 
     def reset(self) -> None:
-        """Put all activity into the middle cell, as at the start of a session: heading along -x."""
+        """Set all activity into the middle cell, as at the start of a session: heading along -x."""
         dense = self.window.new_zeros((() if self.batch is None else (self.batch,)) + self.shape)
         dense[..., self.shape[0] // 2, self.shape[1] // 2, self.shape[2] // 2] = 1.0
         self.activity = dense
@@ -137,7 +137,7 @@ class PoseCellNetwork(Population):
 
     @property
     def activity(self) -> Tensor:
-        """The belief: shape ``([batch,] n_theta, n_y, n_x)``, non-negative, sum 1."""
+        """Activity of all cells, shape ``([batch,] n_theta, n_y, n_x)``, non-negative, sum 1."""
         return (to_dense if self.batch is None else to_tori)(self.packet)
 
     @activity.setter
@@ -147,8 +147,8 @@ class PoseCellNetwork(Population):
             raise MapError(
                 f"PoseCellNetwork: activity has shape {tuple(activity.shape)}, expected {expected}"
             )
-        take = to_packet if self.batch is None else to_packets
-        self.packet = take(activity.to(self.window))
+        convert = to_packet if self.batch is None else to_packets
+        self.packet = convert(activity.to(self.window))
         self._now.slip = _no_slip(self.slip)
 
     @property
@@ -161,7 +161,7 @@ class PoseCellNetwork(Population):
 
     @property
     def peak(self) -> float:
-        """Activity of the most active cell: near 0 when the belief is spread."""
+        """Activity of the most active cell: near 0 if the activity is spread out."""
         return self.packet.values.max().item()
 
     def integrate(self, motion: Motion) -> PoseEstimate | Tensor:
@@ -203,7 +203,7 @@ class PoseCellNetwork(Population):
         return self.estimate
 
     def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
-        """Move and turn the belief a little, as something else has corrected the pose."""
+        """Move and rotate the activity by a correction of the pose."""
         if self.batch is None:
             self.packet = path_integrate(self.packet, 0.0, turn_cells, (dx_cells, dy_cells))
         else:
@@ -213,12 +213,12 @@ class PoseCellNetwork(Population):
     def _measure_slip(
         self, before: PoseEstimate | Tensor, distance: float | Tensor, turn: float | Tensor
     ) -> None:
-        r"""Find how far the estimate stays behind odometry; the next step makes up for it.
+        r"""Measure the lag of the estimate behind odometry, for which the next step compensates.
 
-        Clipping at zero pulls a moving packet back, by a tenth of its way at 0.1 cell a step.
-        Settling must not move the belief unless a view asks for it, so the slip
+        Clipping at zero holds a moving packet back, by a tenth at 0.1 cells a step. Only views may
+        correct the estimate, not the attractor itself, so the slip
         :math:`s \leftarrow s + \Delta_\text{odometry} - \Delta_\text{estimate}` is fed back,
-        and forgotten where the belief jumped (another packet won) or a view has just injected.
+        and reset where the estimate jumped (another packet won) or a view has just injected.
         """
         after, slip = self.estimate, self._now.slip
         sizes = (self.shape[2], self.shape[1], self.shape[0])
@@ -244,16 +244,16 @@ class PoseCellNetwork(Population):
             kept = (errors.abs() <= 1.0).all(1, keepdim=True)
             self._now.slip = (slip + errors.to(slip)).where(kept, 0.0)
 
-    def see(self, view: ViewMatch) -> None:
-        r"""Bind a new view to the present estimate; let a known one inject where it was bound.
+    def update_from_view(self, view: ViewMatch) -> None:
+        r"""Bind a new view to the present estimate; inject activity where a known one was bound.
 
         .. math:: \delta = \text{energy} \cdot \tfrac{1}{30} \left(30 - e^{1.2\,\text{decay}}\right)
 
-        while positive. ``decay`` grows each time the same view is seen in a row, and every view
-        recovers by ``restore`` each frame, so that a robot that stands still is not dragged along.
+        while positive. ``decay`` grows each time the same view matches in a row, and every view
+        recovers by ``restore`` each frame, so that a robot at a standstill is not displaced.
 
         Raises:
-            MapError: If ``view`` names a template that was never seen as new.
+            MapError: If ``view`` is a template that was never bound.
         """
         c = self.config
         decay = self.bindings["decay"]
@@ -261,7 +261,7 @@ class PoseCellNetwork(Population):
             if view.template != self.bindings.n:
                 raise MapError(
                     f"PoseCellNetwork: new view {view.template}, expected {self.bindings.n}; "
-                    "views and bindings must come from the same life"
+                    "views and bindings must come from the same session"
                 )
             at = self.estimate
             self.bindings.append(x=at.x, y=at.y, theta=at.theta, decay=c.active_decay)
@@ -298,8 +298,8 @@ class PoseCellNetwork(Population):
         self._now.injected = True
 
     def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:
-        """Advance one frame: the view injects, the attractor settles, odometry moves it."""
-        self.see(view)
+        """Advance one frame: inject by the view, settle the attractor, move it by odometry."""
+        self.update_from_view(view)
         return self.integrate(motion)
 
     def step(self, now: StepInput, observation: Observation) -> None:
@@ -312,7 +312,7 @@ class PoseCellNetwork(Population):
         return TWO_PI * self.estimate.theta / self.config.n_theta
 
     def follow(self, correction: Correction) -> None:
-        """Move and turn the belief by what another population has corrected."""
+        """Move and rotate the activity by the correction of another population."""
         if not correction.moves:
             return
         c = self.config
@@ -320,11 +320,11 @@ class PoseCellNetwork(Population):
         self.nudge(dx / c.cell_size_m, dy / c.cell_size_m, correction.turn_rad * c.n_theta / TWO_PI)
 
     def belief(self, map_: LeadableMap) -> Belief:
-        """Return the pose on the map: the cells repeat themselves on the torus."""
+        """Return the pose on the map; that of the cells repeats on the torus."""
         return Belief(map_.pose, 0.0, map_.current, map_.pose_table)
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
-        """Create, link or set an experience by the view and the pose at which it was learnt."""
+        """Create, link or set an experience by the view and the pose-cell estimate."""
         return Decision(*map_(now.motion, now.view, self.estimate, now.frame, kidnapped=now.vetoed))
 
     @property
@@ -342,10 +342,10 @@ class PoseCellNetwork(Population):
         return {"cells/activity": (activity.sum(axis=0), activity.sum(axis=1))}
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
-        """Move bindings and activity of the partial session on the torus, and join the bindings.
+        """Move bindings and activity of the partial session on the torus, and merge the bindings.
 
-        The activity moves too, so that the belief is where the robot is (multisession RatSLAM,
-        Algorithm 1, line 4). Fatigue of the views comes along. :func:`moved_cells` has the
+        The activity moves too, so that it stays at the robot's pose (multisession RatSLAM,
+        Algorithm 1, line 4). The fatigue of the views is kept. :func:`moved_cells` has the
         equation.
         """
         kept = torch.from_numpy(join.kept_views)
@@ -371,14 +371,14 @@ class PoseCellNetwork(Population):
     def moved_cells(
         self, loaded: State, partial: State, match: Match, config: BrainConfig
     ) -> MovedCells:
-        """Move the partial session on the torus, so that the matched experience is at one pose."""
+        """Move the partial session on the torus, so that the matched experiences coincide."""
         return move_session(loaded, partial, match, config)
 
     @classmethod
     def faults(
         cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
     ) -> Iterator[str]:
-        """Say where activity or bindings cannot be those of pose cells."""
+        """Yield activity and bindings that are invalid."""
         window, origin, bound = state["window"], state["origin"].tolist(), len(state["bindings.x"])
         if bound != n_views:
             yield f"{n_views} views, {bound} of them bound to pose cells"

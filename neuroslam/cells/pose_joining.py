@@ -1,4 +1,4 @@
-"""How the pose cells of a session move on the torus when its map merges into another."""
+"""Movement of a session's pose cells on the torus when its map merges into another."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from neuroslam.state.mergeable import State
 
 
 def move_session(loaded: State, partial: State, match: Match, config: BrainConfig) -> MovedCells:
-    """Move bindings and experiences so that the matched experience is at the loaded one's cells.
+    """Move bindings and experiences so that the matched experiences coincide on the torus.
 
     Args:
         loaded: State of the whole brain that is merged into.
         partial: State of the whole brain of the session that moves.
         match: Where the two maps meet.
-        config: Of both; ``sessions.cells`` says whether the session turns, too.
+        config: Of both; ``sessions.cells`` sets whether the session also rotates.
     """
     cells = config.pose_cells
     torus = (cells.n_xy, cells.n_xy, cells.n_theta)

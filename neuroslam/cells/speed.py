@@ -27,22 +27,37 @@ _SAMPLES = 64
 class SpeedCellConfig(Section):
     """Speed cells: a population of linear rates, and the read-out of a speed from them."""
 
-    n: int = Field(32, ge=2, description="cells")
-    max_speed_m_s: float = Field(2.0, gt=0, description="speeds above it raise no rate any more")
+    n: int = Field(
+        default=32, ge=2, description="number of cells; larger: the read-out averages more noise"
+    )
+    max_speed_m_s: float = Field(
+        default=2.0,
+        gt=0,
+        description="speed above which rates stay constant; larger: less rate for each m/s",
+    )
     rest_hz: tuple[float, float] = Field(
-        (1.0, 10.0), description="band of the cells' rates at rest"
+        default=(1.0, 10.0), description="range of the cells' rates at rest"
     )
     top_hz: tuple[float, float] = Field(
-        (15.0, 60.0), description="band of the cells' rates at max_speed_m_s"
+        default=(15.0, 60.0),
+        description="range of the cells' rates at max_speed_m_s; larger: noise counts less",
     )
     lead_s: tuple[float, float] = Field(
-        (0.05, 0.08), description="band of times by which cells run ahead of the speed"
+        default=(0.05, 0.08), description="range of times by which cells anticipate the speed"
     )
     smooth_s: float = Field(
-        0.05, gt=0, description="in which acceleration is measured; longer: less noise, later"
+        default=0.05,
+        gt=0,
+        description="time constant in which acceleration is measured; larger: less noise, more "
+        "delay",
     )
-    noise_hz: float = Field(0.0, ge=0, description="std of the noise of every rate, each step")
-    seed: int = Field(0, ge=0, description="of the bands and of the noise")
+    noise_hz: float = Field(
+        default=0.0,
+        ge=0,
+        description="standard deviation of the noise of each rate in each step; larger: noisier "
+        "speed",
+    )
+    seed: int = Field(default=0, ge=0, description="seed of the tuning and of the noise")
 
     @model_validator(mode="after")
     def _bands_are_bands(self) -> Self:

@@ -14,12 +14,12 @@ from neuroslam.state.match import Match, Pairs
 from neuroslam.types import Pose
 
 _LEAST_WALLS = 6
-_LEAST_SHARE = 0.6  # of the smaller memory's walls must find their like
-_CLEARLY = 0.85  # any other way to lay the maps may explain so many of those at most
+_LEAST_SHARE = 0.6  # of the walls of the smaller map that must match
+_CLEARLY = 0.85  # largest share of those that any other alignment may match
 _BEARING_RAD = math.radians(15.0)
-_OFF_SIGMAS = 2.5  # of a wall's distance: farther off is another wall
-_RMS_SIGMAS = 0.85  # by which all together may be off
-_LEAST_SPREAD = 0.08  # of normals: else the maps slide along parallel walls
+_OFF_SIGMAS = 2.5  # standard deviations within which two walls match
+_RMS_SIGMAS = 0.85  # largest RMS residual, in standard deviations
+_LEAST_SPREAD = 0.08  # of normals: parallel walls leave the alignment open along them
 _TURNS = 12
 _CANDIDATES = 20_000
 _ROUNDS = 12
@@ -39,15 +39,15 @@ class Outline(NamedTuple):
 
 
 class OutlineAlignment(NamedTuple):
-    """How one outline lies in another.
+    """Alignment of one outline with another.
 
     Attributes:
-        turn_rad: By how much it is turned about its origin.
-        move_m: And then moved, ``(2,)``.
-        n_same: Walls that find their like then.
-        off_m: By how much those are off, root mean square.
-        runner_up: Most walls that any other way to lay it explains.
-        spread: How well the walls' normals fix both directions, 0 to 0.5.
+        turn_rad: Rotation about the origin.
+        move_m: Translation after that, ``(2,)``.
+        n_same: Number of walls that match.
+        off_m: RMS residual of those, metres.
+        runner_up: Largest number of walls that match in another alignment.
+        spread: Smaller eigenvalue of the covariance of normals, 0 (parallel walls) to 0.5.
     """
 
     turn_rad: float
@@ -61,21 +61,21 @@ class OutlineAlignment(NamedTuple):
 def align_outlines(
     loaded: Outline, partial: Outline, turns_rad: list[float], reach_m: float, off_m: float
 ) -> OutlineAlignment:
-    r"""Find the motion that lays one outline on another, by trying all and refining the best.
+    r"""Find the rigid alignment of one outline with another: grid search, then refinement.
 
-    A wall finds its like where a foot of the other outline with that bearing is within ``reach_m``
-    along the wall and ``off_m`` across it. The refinement solves
+    A wall matches a foot of the other outline with the same bearing within ``reach_m`` along the
+    wall and ``off_m`` across it. The refinement solves
 
     .. math:: \min_{\phi, t} \sum_k \big((R(\phi) f_k + t - g_k) \cdot \mathbf n_k\big)^2
 
-    over the walls that have (point-to-line ICP).
+    over the walls that match (point-to-line ICP).
 
     Args:
-        loaded: Outline that stays.
-        partial: Outline that is moved; not empty, as the other.
-        turns_rad: Turns to try.
-        reach_m: Stretch of a wall that is one memory.
-        off_m: Largest distance of two walls that are the same.
+        loaded: Outline that stays; not empty.
+        partial: Outline that moves; not empty.
+        turns_rad: Rotations to try.
+        reach_m: Extent of a stretch of wall.
+        off_m: Largest distance between two walls that match.
     """
     tree = cKDTree(loaded.feet_m)
     tried: list[tuple[int, float, np.ndarray]] = []
@@ -93,12 +93,12 @@ def align_outlines(
     found = [
         _refine(tree, loaded, partial, *row[1:], reach_m, off_m) for row in tried[: _ROUNDS * 2]
     ]
-    best = max(found, key=lambda laid: (laid.n_same, -laid.off_m))
+    best = max(found, key=lambda each: (each.n_same, -each.off_m))
     away = [
-        laid.n_same
-        for laid in found
-        if np.hypot(*(laid.move_m - best.move_m)) > reach_m
-        or abs(wrap_angle(laid.turn_rad - best.turn_rad)) > _BEARING_RAD
+        each.n_same
+        for each in found
+        if np.hypot(*(each.move_m - best.move_m)) > reach_m
+        or abs(wrap_angle(each.turn_rad - best.turn_rad)) > _BEARING_RAD
     ]
     return best._replace(runner_up=max(away, default=0))
 
@@ -125,7 +125,7 @@ def _refine(
     for _ in range(_ROUNDS):
         moved = partial.moved(turn, move)
         near = tree.query_ball_point(moved.feet_m, 1.5 * reach_m)
-        rows = []  # of each wall the foot that is the least across it
+        rows = []  # for each wall the foot nearest across it
         for k, candidates in enumerate(near):
             if not candidates:
                 continue
@@ -144,7 +144,7 @@ def _refine(
         feet, normals, across = table[:, :2], table[:, 2:4], table[:, 4]
         centre = feet.mean(0)
         lever = (feet - centre)[:, 0] * normals[:, 1] - (feet - centre)[:, 1] * normals[:, 0]
-        # A prior keeps what the walls do not fix, as the turn of a circle, where it was.
+        # A prior fixes what walls leave open, such as the rotation of a circle.
         system = np.column_stack([normals, lever])
         prior = np.diag([1e-6, 1e-6, 1.0])
         step = np.linalg.solve(system.T @ system + prior, -system.T @ across)
@@ -167,16 +167,16 @@ def match_walls(
     *,
     compass: bool,
 ) -> tuple[Match | None, str]:
-    """Align the walls that two sessions remember.
+    """Find the alignment of two maps by the walls that both sessions remember.
 
     Args:
         outlines: Of the loaded session and of the partial one.
         maps: Poses of their experiences, ``(n, 3)`` each.
         config: Of both.
-        compass: Both had a compass, so neither is turned.
+        compass: Whether both had a compass, so that no rotation is needed.
 
     Returns:
-        Where the maps meet, or ``None``; and how that was found, or why not, for a reader.
+        The match, or ``None``; and a sentence on how it was found, or why not.
     """
     counts = [len(outline.feet_m) for outline in outlines]
     needed = max(_LEAST_WALLS, math.ceil(_LEAST_SHARE * min(counts)))
@@ -194,15 +194,18 @@ def match_walls(
         f"residual {best.off_m:.3f} m"
     )
     if best.n_same < needed:
-        return None, f"at most {aligned}; {needed} must"
+        return None, f"at most {aligned}; at least {needed} must"
     if best.off_m > _RMS_SIGMAS * memory.sigma_m:
         return None, (
             f"{aligned}; walls of one place leave at most {_RMS_SIGMAS * memory.sigma_m:.3f} m"
         )
     if best.spread < _LEAST_SPREAD:
-        return None, f"{aligned}, but they are all parallel: the maps could slide along them"
+        return (
+            None,
+            f"{aligned}, but they are all parallel, which leaves the position along them open",
+        )
     if best.runner_up > _CLEARLY * best.n_same:
-        return None, f"{aligned}, but {best.runner_up} do in quite another alignment, too"
+        return None, f"{aligned}, but {best.runner_up} do in another alignment too"
     match = _same_experiences(maps, best, config.place_cells.threshold_m)
     if match is None:
         return None, f"{aligned}, but no experience of one is near an experience of the other"
@@ -211,18 +214,17 @@ def match_walls(
 
 
 def outline_of(x: Tensor, y: Tensor, bearing_rad: Tensor, distance_m: Tensor) -> Outline:
-    """Return the feet of walls that were remembered from points, ``(n,)`` each."""
-    x, y, bearing, distance = (
-        column.numpy(force=True) for column in (x, y, bearing_rad, distance_m)
-    )
-    feet = np.column_stack([x + distance * np.cos(bearing), y + distance * np.sin(bearing)])
+    """Return the outline of walls: anchors, bearings and distances, ``(n,)`` each."""
+    columns = (x, y, bearing_rad, distance_m)
+    at_x, at_y, bearing, distance = (column.numpy(force=True) for column in columns)
+    feet = np.column_stack([at_x + distance * np.cos(bearing), at_y + distance * np.sin(bearing)])
     return Outline(feet, bearing)
 
 
 def _same_experiences(
     maps: tuple[np.ndarray, np.ndarray], alignment: OutlineAlignment, threshold_m: float
 ) -> Match | None:
-    """Pair the experiences that are nearer than two place cells of one map may be."""
+    """Pair experiences that are nearer than the smallest distance of two place cells."""
     loaded, partial = maps
     moved = Outline(partial[:, :2], partial[:, 2]).moved(alignment.turn_rad, alignment.move_m)
     away, nearest = cKDTree(loaded[:, :2]).query(moved.feet_m)

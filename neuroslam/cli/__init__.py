@@ -4,12 +4,12 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO, cast
 
-# A brain's arrays are small: one thread is faster, and the libraries look at this when they load.
+# One thread is faster for the small arrays of a brain; libraries read this when they are loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import typer
@@ -32,9 +32,9 @@ from neuroslam.errors import NeuroslamError, RenamedKeyWarning
 
 
 class _Commands(TyperGroup):
-    """Commands whose interruption is told by :func:`main`; typer's own would say nothing."""
+    """Group of commands whose interruption :func:`main` reports; typer reports none."""
 
-    def invoke(self, ctx: typer.Context) -> object:
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - a type that typer keeps to itself
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -51,8 +51,8 @@ app = typer.Typer(
 )
 
 
-def _tell_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         say(f"neuroslam {version('neuroslam')}")
         raise typer.Exit
 
@@ -61,13 +61,15 @@ def _tell_version(asked: bool) -> None:
 def _options(
     _version: Annotated[
         bool,
-        typer.Option("--version", callback=_tell_version, is_eager=True, help="Tell the version."),
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
-    """Take the options that belong to no command."""
+    """Options of no particular command."""
 
 
-_COMMANDS = {
+_COMMANDS: dict[str, Callable[..., int]] = {
     "run": run_command,
     "resume": resume_command,
     "merge": merge_command,
@@ -92,14 +94,14 @@ for _name, _command in _COMMANDS.items():
 
 @contextmanager
 def _quiet_writers() -> Iterator[None]:
-    """Let no thread print a disk's fault: TensorBoard's writer raises it again where it is used."""
+    """Print no disk error of a thread: the writer of TensorBoard raises it again in ours."""
     before = threading.excepthook
 
-    def failed(what: threading.ExceptHookArgs) -> None:
+    def hook(what: threading.ExceptHookArgs) -> None:
         if not isinstance(what.exc_value, OSError):
             before(what)
 
-    threading.excepthook = failed
+    threading.excepthook = hook
     try:
         yield
     finally:
@@ -108,14 +110,22 @@ def _quiet_writers() -> Iterator[None]:
 
 @contextmanager
 def _warnings_in_one_line(command: str) -> Iterator[None]:
-    """Print a warning of an old name as a line, once."""
+    """Print each warning about a renamed key once, in one line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", RenamedKeyWarning)
-        python, printed = warnings.showwarning, set()
+        python = warnings.showwarning
+        printed: set[str] = set()
 
-        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:  # noqa: ANN401
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
             if not issubclass(category, RenamedKeyWarning):
-                python(message, category, *place)
+                python(message, category, filename, lineno, file, line)
             elif str(message) not in printed:
                 printed.add(str(message))
                 complain(command, f"note: {message}")
@@ -125,7 +135,7 @@ def _warnings_in_one_line(command: str) -> Iterator[None]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; 0 is success, 2 a mistake the user can mend, 130 an interruption."""
+    """Run one command; 0 is success, 2 an error that the user can fix, 130 an interruption."""
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
     command = arguments[0] if arguments else ""
     try:
@@ -135,7 +145,7 @@ def main(argv: list[str] | None = None) -> int:
         complain(command, "interrupted")
         return INTERRUPTED
     except typer.TyperException as error:
-        error.show()
+        cast(Any, error).show()  # what typer raises can, though its public base class cannot
         return USER_ERROR
     except NeuroslamError as error:
         complain(command, str(error))

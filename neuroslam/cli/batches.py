@@ -1,4 +1,4 @@
-"""Commands that make many runs: sweep, fleet, experiment."""
+"""Commands for many runs: sweep, fleet, experiment."""
 
 from pathlib import Path
 from typing import Annotated
@@ -32,11 +32,13 @@ def sweep_command(
     out: Out,
     vary: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=A,B,C", help="As view.threshold=0.03,0.05; several are allowed."),
+        typer.Option(metavar="KEY=A,B,C", help="E.g. view.threshold=0.03,0.05; repeatable."),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="So many runs of each, with other noise and random weights."),
+        typer.Option(
+            min=1, help="Runs of each combination, with seeds 0, 1, ... for noise and weights."
+        ),
     ] = None,
     preset: Preset = None,
     config: ConfigFile = None,
@@ -48,15 +50,15 @@ def sweep_command(
     ray: RayAddress = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Map sources with all values of what is varied; exit 2 if a run failed."""
-    from neuroslam.runs.sweep import given, sweep
+    """Map sources with all combinations of values; exit 2 if a run failed."""
+    from neuroslam.runs.sweep import sweep, varied
 
     so_far = (0, 0)
 
-    def note(*done_and_total: int) -> None:
+    def note(done: int, total: int) -> None:
         nonlocal so_far
-        so_far = done_and_total
-        on_done("runs", *so_far)
+        so_far = done, total
+        on_done("runs", done, total)
 
     with show_runs("sweep") as on_done:
         try:
@@ -81,8 +83,8 @@ def sweep_command(
                 done, total = so_far
                 say(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
             raise
-    figures = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
-    keys = [*given(rows), *(key for key in figures if any(row.get(key) for row in rows))]
+    columns = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
+    keys = [*varied(rows), *(key for key in columns if any(row.get(key) for row in rows))]
     say(down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
     failed = [row for row in rows if row["error"]]
     for row in failed:
@@ -103,7 +105,7 @@ def fleet_command(
     ray: RayAddress = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Map each SOURCE as a robot's session, merge all; exit 3: some stay apart, 2: one failed."""
+    """Map each SOURCE as one session, merge all; exit 3: some stay apart, 2: one failed."""
     from neuroslam.runs.fleet import fleet
     from neuroslam.runs.run import resolve_config
 
@@ -122,10 +124,11 @@ def fleet_command(
             on_done=on_done,
         )
     for row in report.sessions:
-        figures = "failed"
+        size = "failed"
         if "frames" in row:
-            figures = f"{counted(row['frames'], 'frame')}, {counted(row['experiences'], 'place')}"
-        say(f"session {row['session']}: {row['source']}: {figures}")
+            frames, experiences = row["frames"], row["experiences"]
+            size = f"{counted(frames, 'frame')}, {counted(experiences, 'experience')}"
+        say(f"session {row['session']}: {row['source']}: {size}")
     for row in report.tree:
         first, second = ("+".join(map(str, row[name])) for name in ("first", "second"))
         done = "merged" if row["merged"] else "not merged"
@@ -134,9 +137,9 @@ def fleet_command(
         error = report.merged.get("ate_rmse_m")
         say(
             f"one map of sessions {', '.join(map(str, report.merged['sessions']))}: "
-            f"{counted(report.merged['experiences'], 'place')}, "
+            f"{counted(report.merged['experiences'], 'experience')}, "
             f"{counted(report.merged['links'], 'link')}"
-            + ("" if error is None else f"; error against the truth (ATE, rigid) {error:.3f} m")
+            + ("" if error is None else f"; ATE (rigid) {error:.3f} m")
         )
     for part in report.apart:
         say(f"stays apart: sessions {', '.join(map(str, part['sessions']))}")
@@ -151,7 +154,7 @@ def experiment_command(
     out: Out,
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder that holds the recordings, where the experiment needs some."),
+        typer.Option(help="Folder of the recordings, if the experiment needs any."),
     ] = None,
     jobs: Jobs = None,
     ray: RayAddress = None,
@@ -159,12 +162,12 @@ def experiment_command(
         list[str] | None,
         typer.Option(
             metavar="NAME=FILE",
-            help="view-matching: a network of torchvision too, with the weights of FILE; "
+            help="view-matching: add a network of torchvision, with the weights in FILE; "
             "repeatable.",
         ),
     ] = None,
 ) -> int:
-    """Repeat an experiment of a paper."""
+    """Reproduce an experiment of a paper."""
     from neuroslam.experiments import run_experiment
 
     networks = dict(_name_and_file(text) for text in network or [])
@@ -179,5 +182,7 @@ def experiment_command(
 def _name_and_file(text: str) -> tuple[str, Path]:
     name, equals, file = text.partition("=")
     if not (name and equals and file):
-        raise ConfigError(f"--network {text!r}: expected NAME=FILE, as resnet18.layer3=weights.pth")
+        raise ConfigError(
+            f"--network {text!r}: expected NAME=FILE, e.g. resnet18.layer3=weights.pth"
+        )
     return name, Path(file)

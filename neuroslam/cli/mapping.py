@@ -41,8 +41,8 @@ def run_command(
         typer.Option(
             "--map",
             metavar="OLD",
-            help="Stored map to go on in, a run's folder or a brain file; several are allowed. "
-            "Without --preset or --config its config is taken.",
+            help="Stored map to join, a run folder or brain file; repeatable. Without --preset or "
+            "--config, its config is used.",
         ),
     ] = None,
     confirm: Confirm = None,
@@ -87,7 +87,7 @@ def resume_command(
     no_tensorboard: NoTensorboard = False,
     save_every: SaveEvery = 60.0,
 ) -> int:
-    """Go on where the run in DIR stopped."""
+    """Resume the run in DIR."""
     from neuroslam.runs.run import resume
 
     with show_frames(str(out)) as (on_start, on_step):
@@ -100,7 +100,7 @@ def resume_command(
             save_every_s=save_every,
         )
     if not summary.added and not summary.failure and not summary.interrupted:
-        say("Nothing was left to do: the run had come to its end already")
+        say("Nothing to do: the run has reached its end")
     return _report(summary, out, "resume")
 
 
@@ -115,7 +115,7 @@ def merge_command(
     confirm: Confirm = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Merge two finished sessions; exit 0 merged, 3 refused, and then nothing is written."""
+    """Merge two finished sessions; exit 3 if the merge is refused: nothing is written then."""
     from neuroslam.runs.merge import merge_runs
 
     summary, reports = merge_runs(first, second, out, confirm=confirm, overwrite=overwrite)
@@ -129,14 +129,14 @@ def merge_command(
 
 
 def demo_command(out: Out = Path("demo")) -> int:
-    """Map an embedded world in two sessions that become one map."""
+    """Map a rendered world in two sessions and merge them into one map."""
     from neuroslam.runs.demo import demo
 
     with show_frames("world:corridor") as (on_start, on_step):
         rows = demo(out, on_step, on_start)
-    table = Table(title="A corridor in two sessions, the second from an unknown place")
-    table.add_column("what")
-    table.add_column("figure", justify="right")
+    table = Table(title="A corridor in two sessions, the second from an unknown start")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
     for name, value in rows:
         table.add_row(name, value)
     say(table)
@@ -162,16 +162,16 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         say(note)
     if not figures["experiences"]:
         say(
-            "No places: no picture has the contrast that view.min_contrast asks for"
+            "No experiences: no image reaches the contrast view.min_contrast"
             if summary.pictures
-            else "No places: there were no pictures. Without a camera: --preset slrb"
+            else "No experiences: the source has no images. Without a camera, use --preset slrb"
         )
     if "place_cells" in figures:
         lost = figures["lost_s"]
         say(
             f"{counted(figures['place_cells'], 'place cell')}, "
-            f"{counted(figures['walls'], 'stretch of wall', 'stretches of wall')}; "
-            + (f"lost for {lost:.0f} s: walls contradicted the map" if lost else "never lost")
+            f"{counted(figures['walls'], 'wall segment')}; "
+            + (f"lost for {lost:.0f} s: walls did not fit the map" if lost else "never lost")
         )
     for report in summary.merges:
         _print_report(report)
@@ -181,11 +181,11 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     if summary.unplaced:
         say(
             f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
-            "where the robot only seemed to be kidnapped: --set sessions.kidnapped=ignore"
+            "if the robot was not kidnapped: --set sessions.kidnapped=ignore"
         )
     if summary.accuracy:
         say(
-            f"error against the truth (ATE, rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
+            f"ATE (rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
             f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
         )
     say(f"Written: {out}")
@@ -193,7 +193,7 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         complain(command, f"stopped early: {summary.failure}")
         return USER_ERROR
     if summary.interrupted:
-        complain(command, f"interrupted; go on with: neuroslam resume {out}")
+        complain(command, f"interrupted; continue with: neuroslam resume {out}")
         return INTERRUPTED
     return 0
 
@@ -206,7 +206,7 @@ def _print_not_joined(summary: "RunSummary") -> None:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    from neuroslam.merging.merge import MergeReport
+    from neuroslam.merging.report import MergeReport
 
     first, *others = MergeReport(**report).lines()
     at = "" if report["at_frame"] is None else f"frame {report['at_frame']}: "

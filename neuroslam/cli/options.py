@@ -11,7 +11,7 @@ import typer
 
 
 class OnBadFrame(StrEnum):
-    """What to do with a frame that cannot be used."""
+    """What to do with an unusable frame."""
 
     stop = "stop"
     skip = "skip"
@@ -21,13 +21,14 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
 MapFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="Brain file, or the folder of a run.")
 ]
-RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` wrote.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 NoTensorboard = Annotated[bool, typer.Option("--no-tensorboard", help="Write no events/.")]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
 Confirm = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Places that must agree before maps are joined; 1: the first view decides."
+        min=1,
+        help="Experiences that must agree before maps are joined; 1: the first match decides.",
     ),
 ]
 
@@ -44,20 +45,22 @@ Source = Annotated[
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
 ConfigFile = Annotated[
-    Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; laid over the preset.")
+    Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; overrides the preset.")
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="As view.threshold=0.04; laid over both."),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="E.g. view.threshold=0.04; overrides both; repeatable."
+    ),
 ]
 Start = Annotated[int, typer.Option(help="First frame.")]
-BadFrame = Annotated[
-    OnBadFrame, typer.Option(help="Stop at a frame that cannot be used, or skip it.")
-]
+BadFrame = Annotated[OnBadFrame, typer.Option(help="Stop at an unusable frame, or skip it.")]
 SaveEvery = Annotated[
     float,
     typer.Option(
-        metavar="SECONDS", min=0.0, help="Save while driving, for `resume`; 0: only at the end."
+        metavar="SECONDS",
+        min=0.0,
+        help="Interval of saves during the run, for `resume`; 0: only at the end.",
     ),
 ]
 Overwrite = Annotated[
@@ -65,7 +68,7 @@ Overwrite = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="So many at once; 1, or as many as the cluster has processors."),
+    typer.Option(min=1, help="Runs at a time; default: 1, on a cluster its number of processors."),
 ]
 RayAddress = Annotated[
     str | None,
@@ -79,13 +82,13 @@ Plugins = Annotated[
     typer.Option(
         "--plugin",
         metavar="FILE",
-        help="Python file that registers populations of yours; several are allowed.",
+        help="Python file that registers populations; repeatable.",
     ),
 ]
 
 
 def with_plugins(command: Callable[..., int]) -> Callable[..., int]:
-    """Let a command take ``--plugin``, and load those files before it runs."""
+    """Add ``--plugin`` to a command; the files are loaded before it runs."""
 
     @wraps(command)
     def run(*args: object, plugin: list[Path] | None = None, **options: object) -> int:

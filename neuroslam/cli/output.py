@@ -1,10 +1,10 @@
-"""What the commands say, and the codes that they exit with."""
+"""Output and exit codes of the commands."""
 
 import sys
 
 from rich.console import Console
 
-console = Console(markup=False, soft_wrap=True)  # for paths: brackets in them, one line each
+console = Console(markup=False, soft_wrap=True)  # keeps paths whole: brackets, long lines
 
 INTERRUPTED = 130
 USER_ERROR = 2
@@ -12,10 +12,10 @@ REFUSED = 3
 
 
 def complain(command: str, text: str) -> None:
-    """Print a line about what went wrong, where errors go."""
+    """Print one line of error to stderr."""
     print(f"neuroslam {command}: {text}", file=sys.stderr)
 
 
 def say(what: object) -> None:
-    """Print what was found: a line, or a table."""
+    """Print a line or a table to stdout."""
     console.print(what)

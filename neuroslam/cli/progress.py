@@ -1,4 +1,4 @@
-"""What is shown while a command works, where someone is watching."""
+"""Progress shown on a terminal while a command works."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def show_stages(name: str) -> Iterator[Callable[[str], None]]:
-    """Show what is being done, and for how long already; yield what tells it."""
+    """Show the current stage and the elapsed time; yield the function that sets the stage."""
     columns = (TextColumn("{task.description}", style="bold", markup=False), TimeElapsedColumn())
     with Progress(
         *columns, console=output.console, transient=True, disable=not output.console.is_terminal
@@ -26,7 +26,7 @@ def show_stages(name: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def show_runs(name: str) -> Iterator[Callable[[str, int, int], None]]:
-    """Show how many of several runs are done; yield what tells it."""
+    """Show how many runs are done; yield the function to call after each."""
     columns = (
         TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(bar_width=24),
@@ -53,18 +53,18 @@ def show_runs(name: str) -> Iterator[Callable[[str, int, int], None]]:
 def show_frames(
     name: str,
 ) -> Iterator[tuple[Callable[[int | None], None], Callable[["StepResult"], None]]]:
-    """Show frame, frames/s, views and places while a run goes; yield what tells them."""
+    """Show frame, frames/s, templates and experiences; yield the functions to call."""
     columns = (
         TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(bar_width=12),
         TaskProgressColumn(),
         TextColumn("{task.completed:.0f}, {task.fields[rate]:.0f}/s"),
-        TextColumn("{task.fields[templates]} views, {task.fields[experiences]} places"),
+        TextColumn("{task.fields[templates]} templates, {task.fields[experiences]} exp."),
         TimeElapsedColumn(),
     )
     import time
 
-    shown = (Path(name).name or name)[:18]  # all of it fits 80 columns
+    shown = (Path(name).name or name)[:18]  # the line fits 80 columns
     on_screen = output.console.is_terminal
     with Progress(
         *columns,

@@ -1,7 +1,7 @@
-"""Commands that look at what was made: inspect, verify, export, evaluate, plot, report."""
+"""Commands on results: inspect, verify, export, evaluate, plot, report."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.table import Table
@@ -10,12 +10,15 @@ from neuroslam.cli.options import MapFile, RunFolder
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
 
+if TYPE_CHECKING:
+    from neuroslam.evaluation.trajectory import AlignmentMode
+
 
 def inspect_command(path: MapFile) -> int:
-    """Say what is in a map."""
+    """List the content of a map and its sessions."""
     from neuroslam.runs.inspect import inspect
 
-    table = new_table("what", "is", title=str(path), headed=False)
+    table = new_table("quantity", "value", title=str(path), headed=False)
     for name, value in inspect(path):
         table.add_row(name, value)
     say(table)
@@ -23,7 +26,7 @@ def inspect_command(path: MapFile) -> int:
 
 
 def verify_command(path: MapFile) -> int:
-    """Check a map: exit 0 if it is sound, 2 with its faults if not."""
+    """Check a map for faults; exit 2 if there are any."""
     from neuroslam.runs.verify import verify
 
     faults = verify(path)
@@ -38,10 +41,10 @@ def export_command(
     path: MapFile,
     to: Annotated[Path, typer.Argument(metavar="TO", help="File to write.")],
     kind: Annotated[
-        str | None, typer.Option(help="tum, g2o, graphml or nir; as TO ends if not given.")
+        str | None, typer.Option(help="tum, g2o, graphml or nir; default: the suffix of TO.")
     ] = None,
 ) -> int:
-    """Write a map for other programs: TUM, g2o, GraphML, NIR."""
+    """Export a map as TUM, g2o, GraphML or NIR."""
     from neuroslam.runs.export import export
 
     say(f"Written: {export(path, to, kind)}")
@@ -49,22 +52,21 @@ def export_command(
 
 
 def evaluate_command(
-    track: Annotated[
-        Path, typer.Argument(metavar="TRACK", help="A run's folder, or a track as a TUM file.")
-    ],
+    track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
     truth: Annotated[
-        Path | None, typer.Option(help="True track, TUM; a run of a world has its own.")
+        Path | None, typer.Option(help="Ground truth as a TUM file; a run of a world has its own.")
     ] = None,
     align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
 ) -> int:
-    """Compare a track with the truth."""
+    """Compare a trajectory with the ground truth."""
     from neuroslam.runs.evaluate import evaluate
 
-    table = Table(title=f"{track} against the truth, {align} alignment")
+    table = Table(title=f"{track} and ground truth, {align} alignment")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []
-    for name, found, unit in evaluate(track, truth, align, notes.append):
+    mode = cast("AlignmentMode", align)  # looked at there
+    for name, found, unit in evaluate(track, truth, mode, notes.append):
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     say(table)
     for note in notes:
@@ -74,9 +76,9 @@ def evaluate_command(
 
 def plot_command(
     out: RunFolder,
-    to: Annotated[Path | None, typer.Option(help="Folder for the figures; DIR itself.")] = None,
+    to: Annotated[Path | None, typer.Option(help="Folder of the figures; default: DIR.")] = None,
 ) -> int:
-    """Draw the map, the cells that the brain has, and counts over time."""
+    """Draw the map, the cells of the brain, and counts over time."""
     from neuroslam.runs.plot import plot
 
     for path in plot(out, to or out):
@@ -85,15 +87,15 @@ def plot_command(
 
 
 def report_command(
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `merge` wrote.")],
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run or a merge.")],
     to: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write; DIR/report.html.")
+        Path | None, typer.Option("--out", "-o", help="File to write; default: DIR/report.html.")
     ] = None,
     pictures: Annotated[
-        float, typer.Option(help="Room for pictures of frames, in MB; 0: none.")
+        float, typer.Option(help="Size limit of the images of frames, in MB; 0: no images.")
     ] = 12.0,
 ) -> int:
-    """Write one HTML page that explains a run; it needs nothing but a browser."""
+    """Write one HTML page that explains a run, for any browser."""
     from neuroslam.report import write_report
 
     say(f"Written: {write_report(out, to, pictures_mb=pictures)}")

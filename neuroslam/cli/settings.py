@@ -22,7 +22,7 @@ def tune_command(
         bool, typer.Option("--overwrite", help="Replace an earlier tuning in the folder.")
     ] = False,
 ) -> int:
-    """Find the parameters of a SOURCE's pictures, without truth; write a config for `run`."""
+    """Tune parameters from the images of a SOURCE, without ground truth; write a config."""
     from neuroslam.runs.run import resolve_config
     from neuroslam.tuning import tune
 
@@ -35,27 +35,29 @@ def tune_command(
             overwrite=overwrite,
             on_stage=on_stage,
         )
-    table = new_table("parameter", "before", "found", "because")
+    table = new_table("parameter", "before", "tuned", "reason")
     for key, (before, found, why) in tuning.changes.items():
         table.add_row(key, *("none" if v is None else shown(v) for v in (before, found)), why)
     say(table)
     for note in tuning.notes:
         say(note)
-    for name, trial in (("before", tuning.before), ("found", tuning.after)):
+    for name, trial in (("before", tuning.before), ("tuned", tuning.after)):
+        if trial is None:
+            continue
         say(
             f"{name}: {trial.n_experiences} experiences, {trial.n_links} links, "
-            f"inconsistency {shown(trial.inconsistency) or 'not known'} (0: none, 1: useless)"
+            f"inconsistency {shown(trial.inconsistency) or 'unknown'} (0: consistent, 1: useless)"
         )
     say(tuning.verdict)
-    say(f"Written: {out}; now: neuroslam run {source} --config {out}/config.toml -o map")
+    say(f"Written: {out}; next: neuroslam run {source} --config {out}/config.toml -o map")
     return 0
 
 
 def presets_command() -> int:
-    """List the presets and what they are for."""
+    """List the presets and their purposes."""
     from neuroslam.config import preset_folder, preset_names
 
-    table = new_table("preset", "for")
+    table = new_table("preset", "purpose")
     for name in preset_names():
         lines = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()
         about = takewhile(lambda line: line.startswith("#"), lines)

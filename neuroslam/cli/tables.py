@@ -1,4 +1,4 @@
-"""Tables of what was found."""
+"""Tables of results."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,13 +7,13 @@ from rich.table import Column, Table
 
 
 def new_table(*names: str, title: str | None = None, headed: bool = True) -> Table:
-    """Make a table whose words are never cut: a name that is told is one to be copied."""
+    """Make a table that folds long cells and never truncates them, so that names can be copied."""
     columns = (Column(name, overflow="fold") for name in names)
     return Table(*columns, title=title, show_header=headed)
 
 
 def down(rows: list[dict[str, Any]], title: str) -> Table:
-    """Make a table of a line a row."""
+    """Make a table with one line per row."""
     table = new_table(*(key.replace("_", " ") for key in rows[0]), title=title)
     for row in rows:
         table.add_row(*map(shown, row.values()))
@@ -21,7 +21,7 @@ def down(rows: list[dict[str, Any]], title: str) -> Table:
 
 
 def across(rows: list[dict[str, Any]], title: str) -> Iterator[Table]:
-    """Make tables of a column a row, three columns each: for many figures of few maps."""
+    """Make transposed tables, three rows as columns each: for many figures of few maps."""
     for first in range(0, len(rows), 3):
         some = rows[first : first + 3]
         table = Table(title=title, show_header=False)
@@ -33,7 +33,7 @@ def across(rows: list[dict[str, Any]], title: str) -> Iterator[Table]:
 
 
 def shown(value: object) -> str:
-    """Write a value as a table has it: numbers with four digits, nothing for NaN."""
+    """Format a value for a table: four significant digits, empty for NaN."""
     if isinstance(value, float):
         return f"{value:.4g}" if value == value else ""  # NaN is not equal to itself
     text = "; ".join(map(shown, value)) if isinstance(value, list) else str(value)

@@ -1,4 +1,4 @@
-"""Every parameter of the brain: name, unit, bounds, what it does; files and presets to set them."""
+"""Parameters of the brain with units and bounds; config files and presets that set them."""
 
 from neuroslam.config.brain import BrainConfig
 from neuroslam.config.classic import CLASSIC_NAMES
@@ -12,17 +12,19 @@ from neuroslam.config.files import (
     read_preset,
     to_toml,
 )
-from neuroslam.config.sections import (
+from neuroslam.config.navigation import (
     BoundaryCellConfig,
     GridCellConfig,
+    PlaceCellConfig,
+    WallMemoryConfig,
+)
+from neuroslam.config.section import Section
+from neuroslam.config.sections import (
     MapConfig,
     OdometryConfig,
-    PlaceCellConfig,
     PoseCellConfig,
-    Section,
     SessionConfig,
     ViewConfig,
-    WallMemoryConfig,
 )
 from neuroslam.config.semantic import SemanticConfig
 

@@ -1,29 +1,31 @@
-"""The config of a brain: which populations it is composed of, and every number in them."""
+"""The config of a brain: which populations it is composed of, and their parameters."""
 
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails
 
-from neuroslam.config.populations import known_kinds, population_class, section_class
-from neuroslam.config.sections import (
+from neuroslam.config.navigation import (
     BoundaryCellConfig,
     GridCellConfig,
+    PlaceCellConfig,
+    WallMemoryConfig,
+)
+from neuroslam.config.populations import known_kinds, population_class, section_class
+from neuroslam.config.section import Section, verbatim_error
+from neuroslam.config.sections import (
     MapConfig,
     OdometryConfig,
-    PlaceCellConfig,
     PoseCellConfig,
-    Section,
     SessionConfig,
     ViewConfig,
-    WallMemoryConfig,
 )
 from neuroslam.config.semantic import SemanticConfig
 
 
 class BrainConfig(Section):
-    """Which populations a brain is composed of, and every number in them.
+    """Which populations a brain is composed of, and their parameters.
 
-    A population that is not one of the three with sections below has its own section under its
-    kind: ``[head_direction]`` of a file, ``config.head_direction`` in Python.
+    A population without a section below has its own, named by its kind: ``[head_direction]`` in a
+    file, ``config.head_direction`` in Python.
 
     Example:
         >>> BrainConfig(view={"threshold": 0.04}).view.threshold
@@ -44,25 +46,34 @@ class BrainConfig(Section):
     semantic: SemanticConfig = SemanticConfig()
     cells: tuple[str, ...] = Field(
         default=("pose",),
-        description="populations; pose: views, pose cells and map (RatSLAM); place: boundary, grid "
-        "and place cells (SLRB); semantic: landmarks (SSP-SLAM); head_direction; speed; or one of "
-        "your own; as pose+place",
+        description="populations, joined by +, as pose+place; pose: views, pose cells and map "
+        "(RatSLAM); place: boundary, grid and place cells (SLRB); semantic: landmarks (SSP-SLAM); "
+        "head_direction; speed; or one of your own",
     )
-    frame_rate_hz: float = Field(default=20.0, gt=0, description="where the source has no times")
-    threads: int = Field(default=1, ge=1, description="of a run; for one brain, one is the fastest")
+    frame_rate_hz: float = Field(
+        default=20.0, gt=0, description="frame rate, where the source has no time stamps"
+    )
+    threads: int = Field(
+        default=1, ge=1, description="CPU threads of a run; for a single brain 1 is the fastest"
+    )
     max_gap_s: float = Field(
-        default=2.0, gt=0, description="a longer gap between frames is an error"
+        default=2.0,
+        gt=0,
+        description="largest time between two frames; sessions.after_gap says what "
+        "a longer gap does",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _with_sections(cls, values: object) -> object:
-        """Check the sections of populations by the classes that those have."""
+        """Check the section of each population with the population's own section class."""
         if not isinstance(values, dict):
             return values
-        checked, refused = dict(values), []
+        checked, refused, named = dict(values), [], _kinds(values.get("cells", ()))
         for key in [key for key in values if key not in cls.model_fields]:
             section = section_class(key) if key in known_kinds() else None
+            if section is None and key in named and key not in known_kinds():
+                continue  # cells says it better: there is no such population
             if section is None:
                 refused.append(
                     InitErrorDetails(type="extra_forbidden", loc=(key,), input=values[key])
@@ -74,7 +85,7 @@ class BrainConfig(Section):
                     raise _inside(key, error) from None
         if refused:
             raise ValidationError.from_exception_data(cls.__name__, refused)
-        for kind in _kinds(values.get("cells", ())):
+        for kind in named:
             if kind not in checked and kind in known_kinds() and (section := section_class(kind)):
                 checked[kind] = section()
         return checked
@@ -90,15 +101,19 @@ class BrainConfig(Section):
         known = known_kinds()
         for kind in value:
             if kind not in known:
-                population_class(kind)  # says which there are
+                population_class(kind)  # raises, with the known kinds
         if not value or len(set(value)) < len(value):
             raise ValueError(
                 f"expected one or several of {', '.join(known)}, each once, joined by +"
             )
         return tuple(kind for kind in known if kind in value)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Go to another process as plain values: sections may be of a plugin not yet loaded."""
+        return BrainConfig.model_validate, (self.model_dump(),)
+
     def section(self, kind: str) -> Section:
-        """Return the section of a population that has its own.
+        """Return the section of a population that has its own section.
 
         Example:
             >>> BrainConfig(cells="pose+speed").section("speed") == BrainConfig(cells="speed").speed
@@ -108,17 +123,17 @@ class BrainConfig(Section):
 
 
 def _kinds(value: object) -> list[str]:
-    """Split ``pose+place``; ``pose_and_place`` is how files of earlier versions have it."""
+    """Split ``pose+place``; files of earlier versions have ``pose_and_place``."""
     if isinstance(value, str):
         return value.replace("_and_", "+").split("+")
     return list(value) if isinstance(value, list | tuple) else []
 
 
 def _inside(section: str, error: ValidationError) -> ValidationError:
-    """Name the section in the errors of its keys."""
+    """Prefix the errors of a section's keys with the name of the section."""
     lines = [
         InitErrorDetails(
-            type=PydanticCustomError(line["type"], "{said}", {"said": line["msg"]}),
+            type=verbatim_error(line["type"], line["msg"]),
             loc=(section, *line["loc"]),
             input=line["input"],
         )

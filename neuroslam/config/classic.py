@@ -1,4 +1,4 @@
-"""OpenRatSLAM's config files: its names for our parameters, and reading them."""
+"""Reader of OpenRatSLAM's config files, and its names for our parameters."""
 
 import configparser
 import math
@@ -45,7 +45,7 @@ _CLASSIC_REGIONS = {
     "vrot_image": ("odometry", "turn_region"),
 }
 
-# What else a classic file holds that has no meaning without ROS: where topics and media are.
+# Keys that mean nothing without ROS: names of topics, paths of media.
 _CLASSIC_IGNORED = {"topic_root", "media_path", "image_file", "enable", "odom_map", "calibrate"}
 
 
@@ -54,10 +54,10 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
 
     Args:
         text: Content of the file.
-        path: Its name, for what is said of mistakes in it.
+        path: Its name, for error messages.
 
     Raises:
-        ConfigError: If it cannot be parsed, a key is unknown, or a value is no number.
+        ConfigError: If it cannot be parsed, a key is unknown, or a value is not a number.
     """
     parser = configparser.ConfigParser(
         interpolation=None, inline_comment_prefixes=("#", ";"), strict=False
@@ -98,16 +98,20 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
         where, name = _CLASSIC_REGIONS[prefix]
         missing = [e for e in ("x_min", "x_max", "y_min", "y_max") if e not in edges]
         if missing:
-            raise ConfigError(f"config {path}: {prefix}_{missing[0]} is missing")
+            raise ConfigError(
+                f"config {path}: {prefix}_{missing[0]} is missing; a region needs all four edges"
+            )
         values.setdefault(where, {})[name] = tuple(
             edges[e] for e in ("x_min", "x_max", "y_min", "y_max")
         )
     cells = values.get("pose_cells", {})
-    for kernel in ("excite", "inhibit"):  # the classic file has one width for place and direction
+    for kernel in ("excite", "inhibit"):  # the classic file has one width for position and heading
         if f"{kernel}_std_xy" in cells:
             cells[f"{kernel}_std_theta"] = cells[f"{kernel}_std_xy"]
     if not math.isfinite(values.get("frame_rate_hz", 1.0)):
-        raise ConfigError(f"config {path}: camera_hz is not a finite number")
+        raise ConfigError(
+            f"config {path}: camera_hz is {values['frame_rate_hz']}; expected a finite number"
+        )
     return values
 
 
@@ -118,5 +122,6 @@ def _classic_keys() -> list[str]:
 
 
 def _as_field(section: str, name: str, number: float) -> float | int | bool:
-    annotation = type(getattr(getattr(BrainConfig(), section), name))
-    return annotation(number) if number == int(number) else number
+    """Return a whole number as the type of the field: ``1.0`` as True for a switch."""
+    kind: type[float] = type(getattr(getattr(BrainConfig(), section), name))
+    return kind(number) if number == int(number) else number

@@ -1,4 +1,4 @@
-"""Presets, config files and assignments: nested values, from which a config is built; and TOML."""
+"""Presets, config files and assignments, read as nested values; a config written as TOML."""
 
 import tomllib
 from pathlib import Path
@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from neuroslam.config.brain import BrainConfig
 from neuroslam.config.classic import from_classic
-from neuroslam.errors import ConfigError, did_you_mean
+from neuroslam.errors import ConfigError, did_you_mean, with_new_names
 
 
 def preset_folder() -> Path:
@@ -54,13 +54,13 @@ def read_config_file(path: Path) -> dict[str, Any]:
     if path.suffix.lower() in (".ini", ".txt"):
         return from_classic(text, path)
     try:
-        return tomllib.loads(text)
+        return _with_new_keys(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"config {path}: not valid TOML: {error}") from None
 
 
 def merge_values(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Lay nested values over others; ``over`` wins key by key.
+    """Merge nested values key by key; those of ``over`` replace those of ``base``.
 
     Example:
         >>> merge_values({"view": {"threshold": 0.1}}, {"view": {"panoramic": True}})
@@ -86,20 +86,32 @@ def parse_assignment(text: str) -> dict[str, Any]:
     key, equals, raw = text.partition("=")
     if not equals or not key.strip():
         raise ConfigError(f"--set {text!r}: expected section.key=value, e.g. view.threshold=0.04")
+    value: Any
     try:
         value = tomllib.loads(f"value = {raw.strip()}")["value"]
     except tomllib.TOMLDecodeError:
         value = raw.strip()
     for part in reversed(key.strip().split(".")):
         value = {part: value}
-    return value
+    return _with_new_keys(value)
+
+
+def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:
+    """Call renamed keys by their present names, before other values are laid over them."""
+    known = dict(values)
+    for name, section in values.items():
+        field = BrainConfig.model_fields.get(name)
+        renamed = getattr(field.annotation, "renamed", None) if field else None
+        if renamed and isinstance(section, dict):
+            known[name] = with_new_names(section, renamed, name)
+    return known
 
 
 def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
     """Check nested values and make the config of a brain from them.
 
     Raises:
-        ConfigError: One line that names the key, what was got and what was expected.
+        ConfigError: One line with the key, the value, and what was expected.
     """
     try:
         return BrainConfig.model_validate(values)
@@ -108,17 +120,17 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
         where = ".".join(part for part in first["loc"] if isinstance(part, str))
         if first["type"] == "unknown_key":
             raise ConfigError(f"{origin}: {first['msg']}") from None
-        said = first["msg"].removeprefix("Value error, ")
-        said = said[0].lower() + said[1:]
+        message = first["msg"].removeprefix("Value error, ")
+        message = message[0].lower() + message[1:]
         if first["type"] == "model_type":
-            said = f"is a section; set one of its keys, as {where}.KEY"
+            message = f"is a section; set one of its keys, as {where}.KEY"
         elif where.endswith(("crop", "region")):
-            said = "expected four whole numbers x_min, x_max, y_min, y_max"
-        raise ConfigError(f"{origin}: {where} = {first['input']!r}: {said}") from None
+            message = "expected four whole numbers x_min, x_max, y_min, y_max"
+        raise ConfigError(f"{origin}: {where} = {first['input']!r}: {message}") from None
 
 
 def to_toml(config: BrainConfig) -> str:
-    """Write the complete config, as in force, as TOML; reading it back gives the same config.
+    """Return the complete config as TOML; reading it back gives the same config.
 
     Example:
         >>> build_config(tomllib.loads(to_toml(BrainConfig()))) == BrainConfig()

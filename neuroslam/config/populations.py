@@ -1,14 +1,17 @@
-"""Which populations there are, by kind: the package's own, installed ones, and those of a file."""
+"""Known populations by kind: the package's own, installed ones, and those of plugin files."""
 
+import hashlib
 import importlib
 import importlib.util
 import os
 import sys
-from importlib.metadata import entry_points
+import traceback
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from neuroslam.errors import ConfigError, did_you_mean
+from neuroslam.errors import ConfigError, did_you_mean, first_line
 
 HOMES = {
     "pose": "neuroslam.cells.pose",
@@ -17,34 +20,34 @@ HOMES = {
     "head_direction": "neuroslam.cells.head_direction",
     "speed": "neuroslam.cells.speed",
 }
-"""Module of each kind that the package has, in the order in which a brain steps them."""
+"""Module of each of the package's own kinds, in the order in which a brain steps them."""
 
 ENTRY_POINTS = "neuroslam.populations"
-"""Group of the entry points by which an installed package adds populations."""
+"""Entry-point group by which an installed package adds populations."""
 
 PLUGINS = "NEUROSLAM_PLUGINS"
-"""Environment variable with the files of :func:`load_plugin`, for the processes of a sweep."""
+"""Environment variable that passes the files of :func:`load_plugin` to processes of a sweep."""
 
 registered: dict[str, type[Any]] = {}
-"""Class of each kind whose module was imported, as :mod:`neuroslam.state.registry` fills it."""
+"""Class of each kind whose module has been imported; :mod:`neuroslam.state.registry` fills it."""
 
-_loaded: set[str] = set()
+_loaded: dict[str, bytes] = {}  # files of load_plugin, and what they held
 
 
 def known_kinds() -> tuple[str, ...]:
-    """Return every kind that a brain may be composed of, the package's own first.
+    """Return all kinds of populations, the package's own first.
 
     Example:
         >>> known_kinds()[:3]
         ('pose', 'place', 'semantic')
     """
     _load_plugins_of_parent()
-    installed = {point.name for point in entry_points(group=ENTRY_POINTS)}
+    installed = _installed(tuple(sys.path)).keys()
     return (*HOMES, *sorted((installed | registered.keys()) - HOMES.keys()))
 
 
 def population_class(kind: str) -> type[Any]:
-    """Return the class of a kind; its module is imported when it is first asked for.
+    """Return the class of a kind; the first call imports its module.
 
     Raises:
         ConfigError: If no such population is known.
@@ -53,10 +56,9 @@ def population_class(kind: str) -> type[Any]:
         importlib.import_module(HOMES[kind])
     if kind not in registered:
         _load_plugins_of_parent()
-    if kind not in registered:
-        for point in entry_points(group=ENTRY_POINTS):
-            if point.name == kind:
-                point.load()
+    point = _installed(tuple(sys.path)).get(kind)
+    if kind not in registered and point is not None:
+        _load_installed(point)
     if kind not in registered:
         raise ConfigError(
             f"unknown population {kind!r}; there are {', '.join(known_kinds())}"
@@ -67,42 +69,99 @@ def population_class(kind: str) -> type[Any]:
 
 
 def section_class(kind: str) -> type[Any] | None:
-    """Return the config section of a population that is not built into :class:`BrainConfig`."""
+    """Return the section class of a population whose section is no field of ``BrainConfig``."""
     return None if kind in ("pose", "place", "semantic") else population_class(kind).config_section
 
 
 def load_plugin(path: str | Path) -> None:
-    """Run a Python file that registers populations; once, however often it is named.
+    """Run a Python file that registers populations; again only when it has been changed.
+
+    Processes that are started from here load it, too.
 
     Raises:
         ConfigError: If it is missing, cannot be run, or registers nothing.
     """
     file = Path(path).resolve()
-    if str(file) in _loaded:
+    try:
+        text = file.read_bytes()
+    except OSError as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
+        raise ConfigError(
+            f"plugin {path}: {why}; expected a Python file with populations"
+        ) from None
+    if _loaded.get(str(file)) == text:
         return
-    if not file.is_file():
-        raise ConfigError(f"plugin {path}: no such file; expected a Python file with populations")
-    before = dict(registered)
-    name = f"neuroslam_plugin_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
+    spec = importlib.util.spec_from_file_location(_module_name(file), file)
     if spec is None or spec.loader is None:
         raise ConfigError(f"plugin {path}: not a Python file; expected one that ends in .py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    before, loaded = dict(registered), _loaded.get(str(file))
+    sys.modules[spec.name] = module
+    _loaded[str(file)] = text  # at once: what it runs may ask for populations itself
     try:
-        spec.loader.exec_module(module)
-    except ConfigError:
-        raise
-    except Exception as error:
-        raise ConfigError(f"plugin {path}: {type(error).__name__}: {error}") from error
-    if registered == before:
-        raise ConfigError(f"plugin {path}: registers no population; decorate one with @register")
-    _loaded.add(str(file))
+        exec(compile(text, str(file), "exec"), module.__dict__)  # not a cached copy of an old one
+        if not any(cls.__module__ == spec.name for cls in registered.values()):
+            raise ConfigError(
+                f"plugin {path}: registers no population; decorate one with @register"
+            )
+    except BaseException as error:
+        registered.clear()
+        registered.update(before)
+        if loaded is None:
+            del _loaded[str(file)], sys.modules[spec.name]
+        else:
+            _loaded[str(file)] = loaded
+        if isinstance(error, ConfigError | KeyboardInterrupt):
+            raise
+        raise ConfigError(f"plugin {path}{_line_of(error, file)}: {_said(error)}") from error
     known = os.environ.get(PLUGINS, "").split(os.pathsep)
     os.environ[PLUGINS] = os.pathsep.join(dict.fromkeys([*filter(None, known), str(file)]))
 
 
+def _module_name(file: Path) -> str:
+    """Name the module of a plugin; two files of one name are two modules."""
+    name = f"neuroslam_plugin_{file.stem}"
+    other = getattr(sys.modules.get(name), "__file__", str(file))
+    return (
+        name if other == str(file) else f"{name}_{hashlib.sha256(str(file).encode()).hexdigest()}"
+    )
+
+
+def _line_of(error: BaseException, file: Path) -> str:
+    lines = [at.lineno for at in traceback.extract_tb(error.__traceback__)
+             if at.filename == str(file)]  # fmt: skip
+    return f", line {lines[-1]}" if lines else ""
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {first_line(error)}"
+
+
+@lru_cache(maxsize=8)
+def _installed(_path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Find entry points by name; to look through all that is installed takes milliseconds."""
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def _load_installed(point: EntryPoint) -> None:
+    """Import the module of an installed population.
+
+    Raises:
+        ConfigError: If that fails, or does not register it.
+    """
+    what = f"population {point.name!r} of the installed {point.value}"
+    try:
+        point.load()
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"{what}: cannot be imported ({_said(error)})") from error
+    if point.name not in registered:
+        raise ConfigError(f"{what}: is not registered; expected @register({point.name!r})")
+
+
 def _load_plugins_of_parent() -> None:
-    """Load the plugins of the process that started this one."""
+    """Load the plugins of the parent process."""
     for file in filter(None, os.environ.get(PLUGINS, "").split(os.pathsep)):
-        load_plugin(file)
+        if file not in _loaded:
+            load_plugin(file)

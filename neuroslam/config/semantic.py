@@ -1,4 +1,6 @@
-"""Sections of the config of a semantic map: space, neurons, path integrator, map, loop closure."""
+"""Sections of the config of a semantic map: space, neurons, path integrator, memory."""
+# Sections are frozen, hence only read: a subclass may narrow the type of a field.
+# pyright: reportIncompatibleVariableOverride=false
 
 import math
 from collections.abc import Mapping
@@ -6,34 +8,65 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from neuroslam.config.sections import Section
+from neuroslam.config.section import Section
 
 
 class SSPSpaceConfig(Section):
-    """How positions become vectors: frequencies and the length scale of the space."""
+    """Space of the semantic pointers: the frequencies and length scale that encode positions."""
 
     kind: Literal["hexagonal", "random", "rectangular"] = Field(
-        "hexagonal", description="hexagonal: modules of grid cells, whose waves close"
+        default="hexagonal",
+        description="choice of frequencies; hexagonal: modules of grid cells; random: drawn from "
+        "seed; rectangular: separate axes",
     )
     dimension: int = Field(
-        2,
+        default=2,
         ge=1,
-        description="of the space that is mapped; if it is not set, as many as length_scale_m or "
-        "reach_m has numbers",
+        description="dimensions of the space; if not set, as many as length_scale_m or reach_m has "
+        "numbers",
     )
-    n_rotations: int = Field(3, ge=1, description="orientations of grid modules")
-    n_scales: int = Field(3, ge=1, description="spacings of grid modules, for each orientation")
-    n_random: int = Field(27, ge=1, description="frequencies of a random space")
-    scale_min: float = Field(1.0, gt=0, description="lowest frequency, rad a length scale")
-    scale_max: float = Field(math.pi, gt=0, description="highest; larger: sharper, more side lobes")
-    scale_spacing: Literal["linear", "log", "random"] = Field("linear", description="in between")
+    n_rotations: int = Field(
+        default=3,
+        ge=1,
+        description="orientations of the grid modules; larger: sharper similarity, more neurons",
+    )
+    n_scales: int = Field(
+        default=3,
+        ge=1,
+        description="spacings of the grid modules for each orientation; larger: fewer side lobes, "
+        "more neurons",
+    )
+    n_random: int = Field(
+        default=27,
+        ge=1,
+        description="frequencies of a random space; larger: fewer side lobes, more neurons",
+    )
+    scale_min: float = Field(
+        default=1.0,
+        gt=0,
+        description="lowest frequency, in rad for each length scale; larger: positions repeat at "
+        "shorter distances",
+    )
+    scale_max: float = Field(
+        default=math.pi,
+        gt=0,
+        description="highest frequency, in rad for each length scale; larger: sharper similarity, "
+        "more side lobes",
+    )
+    scale_spacing: Literal["linear", "log", "random"] = Field(
+        default="linear", description="spacing of the frequencies between scale_min and scale_max"
+    )
     length_scale_m: float | tuple[float, ...] = Field(
-        0.2, description="larger: broader bumps, in all directions or each; larger spaces need it"
+        default=0.2,
+        description="width of the similarity of positions, one number or one for each axis; "
+        "larger: broader; a larger space needs a larger one",
     )
     reach_m: float | tuple[float, ...] = Field(
-        1.0, description="positions are decoded in [-reach, reach], in all directions or each"
+        default=1.0,
+        description="positions are decoded in [-reach, reach], one number or one for each axis; "
+        "larger: a larger space, slower decoding",
     )
-    seed: int = Field(0, ge=0, description="of random frequencies and rotations")
+    seed: int = Field(default=0, ge=0, description="seed of random frequencies and rotations")
 
     @model_validator(mode="before")
     @classmethod
@@ -47,28 +80,45 @@ class SSPSpaceConfig(Section):
     @model_validator(mode="after")
     def _scales_rise(self) -> Self:
         if self.scale_max < self.scale_min:
-            raise ValueError(f"scale_max {self.scale_max} is below scale_min {self.scale_min}")
+            raise ValueError(
+                f"scale_max {self.scale_max} is below scale_min {self.scale_min}; exchange them"
+            )
         for name in ("length_scale_m", "reach_m"):
             value = getattr(self, name)
             each = value if isinstance(value, tuple) else (value,)
             if len(each) not in (1, self.dimension) or min(each) <= 0:
                 raise ValueError(
-                    f"{name} is {value}, must be positive, one number or {self.dimension} of them"
+                    f"{name} is {value}; expected one positive number or {self.dimension} of them"
                 )
         return self
 
 
 class NeuronConfig(Section):
-    """Neurons: their model and how their tuning is drawn."""
+    """Model of the neurons, and the ranges from which their tuning is drawn."""
 
     model: Literal["lif", "stepped_lif", "lif_rate", "relu"] = Field(
-        "lif", description="spikes; of a chip; rates without spikes; rectified units"
+        default="lif",
+        description="lif: leaky integrate-and-fire, spikes; stepped_lif: the same as a "
+        "neuromorphic chip computes it; lif_rate: its firing rate, no spikes; relu: rectified "
+        "linear rate",
     )
-    tau_rc_s: float = Field(0.02, gt=0, description="time constant of the membrane")
-    tau_ref_s: float = Field(0.002, ge=0, description="pause after a spike")
-    max_rate_hz: tuple[float, float] = Field((200.0, 400.0), description="rate at the encoder")
+    tau_rc_s: float = Field(
+        default=0.02, gt=0, description="membrane time constant; larger: slower neurons"
+    )
+    tau_ref_s: float = Field(
+        default=0.002,
+        ge=0,
+        description="refractory period after a spike; larger: lower largest rate",
+    )
+    max_rate_hz: tuple[float, float] = Field(
+        default=(200.0, 400.0),
+        description="range of firing rates for an input at the preferred direction; larger: less "
+        "noise, more spikes",
+    )
     intercept: tuple[float, float] = Field(
-        (-1.0, 0.9), description="projection on the encoder above which it fires"
+        default=(-1.0, 0.9),
+        description="range of projections on the preferred direction above which neurons fire; "
+        "larger: sparser activity",
     )
 
     @model_validator(mode="after")
@@ -76,60 +126,127 @@ class NeuronConfig(Section):
         low, high = self.max_rate_hz
         if not 0 < low <= high or high * self.tau_ref_s >= 1:
             raise ValueError(
-                f"max_rate_hz {self.max_rate_hz} must rise, be positive, and stay below "
-                f"1 / tau_ref_s"
+                f"max_rate_hz is {self.max_rate_hz}; expected 0 < first <= second < 1 / tau_ref_s"
             )
         if not -1 <= self.intercept[0] <= self.intercept[1] < 1:
-            raise ValueError(f"intercept {self.intercept} must rise within [-1, 1)")
+            raise ValueError(f"intercept is {self.intercept}; expected -1 <= first <= second < 1")
         return self
 
 
 class PathIntegratorConfig(Section):
     """Velocity-controlled oscillators: one population of neurons for each frequency."""
 
-    neurons: int = Field(800, ge=10, description="of one oscillator; more: less drift")
-    max_speed_m_s: float = Field(0.5, gt=0, description="faster is cut; larger: coarser rates")
-    tau_s: float = Field(
-        0.1, gt=0, description="recurrent synapse; longer: less drift, and corrections act slower"
+    neurons: int = Field(
+        default=800, ge=10, description="neurons of each oscillator; larger: less drift"
     )
-    input_tau_s: float = Field(0.005, gt=0, description="synapse of corrections")
-    output_tau_s: float = Field(0.005, gt=0, description="synapse of what is read out")
-    stabilise: float = Field(1.0, ge=0, description="pull to the unit circle, Eq. 19; 0: none")
+    max_speed_m_s: float = Field(
+        default=0.5,
+        gt=0,
+        description="largest speed represented; higher speeds are cut to it; larger: lower "
+        "resolution of speed",
+    )
+    tau_s: float = Field(
+        default=0.1,
+        gt=0,
+        description="time constant of the recurrent synapse; larger: less drift, corrections act "
+        "more slowly",
+    )
+    input_tau_s: float = Field(
+        default=0.005,
+        gt=0,
+        description="time constant of the synapse of corrections; larger: smoother, later",
+    )
+    output_tau_s: float = Field(
+        default=0.005,
+        gt=0,
+        description="time constant of the synapse of the read-out; larger: smoother, later",
+    )
+    stabilise: float = Field(
+        default=1.0,
+        ge=0,
+        description="strength of the attraction to the unit circle (Eq. 19); larger: faster "
+        "return; 0: none",
+    )
     amplitude_range: tuple[float, float] = Field(
-        (0.8, 1.2), description="amplitudes for which decoders are solved; (0, ...): a whole disc"
+        default=(0.8, 1.2),
+        description="amplitudes for which the decoders are solved; from 0: the whole disc",
     )
     decoder_noise: float = Field(
-        0.005, gt=0, description="of the highest rate, that decoders are solved against"
+        default=0.005,
+        gt=0,
+        description="noise for which the decoders are solved, as a share of the highest rate; "
+        "larger: robuster, less exact",
     )
     coupling: Literal["none", "modules", "manifold"] = Field(
-        "manifold",
-        description="modules: phases of each close; manifold: all agree on one position",
+        default="manifold",
+        description="how oscillators correct each other; none: not at all; modules: the phases of "
+        "each module; manifold: all oscillators agree on one position",
     )
-    coupling_gain: float = Field(1.0, ge=0, description="of the pull; over tau_s, its rate")
+    coupling_gain: float = Field(
+        default=1.0,
+        ge=0,
+        description="strength of that coupling (its rate is coupling_gain / tau_s); larger: phases "
+        "agree sooner",
+    )
     velocity_neurons: int = Field(
-        0, ge=0, description="neurons that say the velocity, with their noise; 0: exact"
+        default=0,
+        ge=0,
+        description="neurons that represent the velocity; larger: less noise; 0: the exact "
+        "velocity",
     )
     phase_noise_rad: float = Field(
-        0.0, ge=0, description="algebraic tier: diffusion of each phase, rad over a root of seconds"
+        default=0.0,
+        ge=0,
+        description="algebraic tier: phase noise, in rad for a square root of a second; larger: "
+        "more drift",
     )
 
 
 class SemanticMapConfig(Section):
-    """The associative memory from landmarks' pointers to their places."""
+    """Associative memory from the pointers of landmarks to the pointers of their positions."""
 
-    neurons: int = Field(550, ge=10, description="of each of memory, recall and error")
-    intercept: float = Field(0.1, ge=-1, lt=1, description="similarity at which memory fires")
-    relay: bool = Field(False, description="what is recalled passes through neurons of its own")
-    pes_rate: float = Field(5e-3, ge=0, description="learning of what is recalled")
-    voja_rate: float = Field(1e-4, ge=0, description="encoders move to keys; 0: they are keys")
+    neurons: int = Field(
+        default=550,
+        ge=10,
+        description="neurons each of memory, recall and error; larger: more landmarks, less noise",
+    )
+    intercept: float = Field(
+        default=0.1,
+        ge=-1,
+        lt=1,
+        description="similarity above which memory neurons fire; larger: landmarks interfere less",
+    )
+    relay: bool = Field(
+        default=False, description="pass the recalled pointer through a population of its own"
+    )
+    pes_rate: float = Field(
+        default=5e-3,
+        ge=0,
+        description="learning rate of the recalled pointer (PES); larger: faster, less stable",
+    )
+    voja_rate: float = Field(
+        default=1e-4,
+        ge=0,
+        description="learning rate of the encoders towards the keys (Voja); 0: encoders are the "
+        "keys from the start",
+    )
     plasticity: Literal["novelty", "constant"] = Field(
-        "novelty", description="novelty: what is known is learnt slower"
+        default="novelty",
+        description="novelty: known landmarks are learnt more slowly; constant: all at the same "
+        "rate",
     )
     least_plasticity: float = Field(
-        0.01, ge=0, le=1, description="share of the rate that is left for what is known"
+        default=0.01,
+        ge=0,
+        le=1,
+        description="share of the learning rate that is left for known landmarks; larger: they "
+        "follow changes faster",
     )
     learning_rate_s: float = Field(
-        8.0, gt=0, description="algebraic tier: share that is learnt in a second"
+        default=8.0,
+        gt=0,
+        description="algebraic tier: learning rate for each second in view; larger: faster, "
+        "noisier",
     )
 
 
@@ -137,88 +254,188 @@ class SSPSLAMConfig(Section):
     """SSP-SLAM: path integration, a semantic map, and corrections from it."""
 
     tier: Literal["algebraic", "rate", "spiking"] = Field(
-        "spiking", description="vectors alone; rates of neurons; spikes"
+        default="spiking",
+        description="how it is computed; algebraic: vectors, no neurons; rate: firing rates of "
+        "neurons; spiking: spikes",
     )
-    time_step_s: float = Field(1e-3, gt=0, le=0.1, description="of the simulation")
-    seed: int = Field(0, ge=0, description="of neurons, noise and pointers")
+    time_step_s: float = Field(
+        default=1e-3,
+        gt=0,
+        le=0.1,
+        description="time step of the simulation; larger: faster, less exact",
+    )
+    seed: int = Field(default=0, ge=0, description="seed of neurons, noise and pointers")
     space: SSPSpaceConfig = SSPSpaceConfig()
     neurons: NeuronConfig = NeuronConfig()
     integrator: PathIntegratorConfig = PathIntegratorConfig()
     map: SemanticMapConfig = SemanticMapConfig()
     binding: Literal["exact", "neurons"] = Field(
-        "neurons", description="circular convolution in populations, or exactly"
+        default="neurons",
+        description="circular convolution; neurons: by populations; exact: without neurons",
     )
-    binding_neurons: int = Field(50, ge=2, description="of each product of two numbers")
-    vector_neurons: int = Field(550, ge=0, description="object-vector cells; 0: exact")
-    vector_reach_m: float = Field(0.3, gt=0, description="how far object-vector cells reach")
-    places: bool = Field(False, description="learn what is at places, too: areas can be asked for")
-    grid_neurons: int = Field(0, ge=0, description="grid cells that say the position; 0: exact")
+    binding_neurons: int = Field(
+        default=50,
+        ge=2,
+        description="neurons of each product of two numbers in a binding; larger: less noise",
+    )
+    vector_neurons: int = Field(
+        default=550,
+        ge=0,
+        description="object-vector cells, which represent the displacement to a landmark; larger: "
+        "less noise; 0: the exact displacement",
+    )
+    vector_reach_m: float = Field(
+        default=0.3,
+        gt=0,
+        description="largest displacement that object-vector cells represent; larger: lower "
+        "resolution",
+    )
+    places: bool = Field(
+        default=False,
+        description="also learn what is at each position, so that areas can be queried",
+    )
+    grid_neurons: int = Field(
+        default=0,
+        ge=0,
+        description="grid cells that represent the position; larger: less noise; 0: the exact "
+        "pointer",
+    )
     attention: Literal["sum", "nearest", "turns"] = Field(
-        "turns", description="of several landmarks in view: all at once, one, one after another"
+        default="turns",
+        description="of several landmarks in view; sum: all at once; nearest: the nearest one; "
+        "turns: one after another",
     )
-    turn_s: float = Field(0.5, gt=0, description="how long a landmark is attended to")
-    gate: float = Field(0.2, description="similarity below which the map does not correct")
-    gain: float = Field(0.2, ge=0, description="of a correction; over integrator.tau_s, its rate")
+    turn_s: float = Field(
+        default=0.5,
+        gt=0,
+        description="time for which one landmark is attended to; larger: fewer switches",
+    )
+    gate: float = Field(
+        default=0.2,
+        description="similarity of recalled and believed position below which the map does not "
+        "correct; larger: fewer corrections",
+    )
+    gain: float = Field(
+        default=0.2,
+        ge=0,
+        description="strength of a correction (its rate is gain / integrator.tau_s); larger: "
+        "faster correction",
+    )
     relocalise_after_s: float = Field(
-        0.5, ge=0, description="of a known landmark that contradicts, then it is believed; 0: never"
+        default=0.5,
+        ge=0,
+        description="time for which known landmarks must contradict the position before the animal "
+        "relocalises by them; larger: later, fewer mistakes; 0: never",
     )
     quantised: bool = Field(
-        False, description="weights of 8 bits, neurons of a chip, no function outside of them"
+        default=False,
+        description="weights of 8 bits and neurons of a neuromorphic chip, no function outside of "
+        "neurons",
     )
 
 
 class RoomSpaceConfig(SSPSpaceConfig):
-    """The space of a robot among rooms: metres in place of arm's lengths."""
+    """The space of a robot among rooms: metres, not an arm's length."""
 
-    n_rotations: int = Field(5, ge=1, description="orientations of grid modules")
-    n_scales: int = Field(5, ge=1, description="spacings of grid modules, for each orientation")
+    n_rotations: int = Field(
+        default=5,
+        ge=1,
+        description="orientations of the grid modules; larger: sharper similarity, more neurons",
+    )
+    n_scales: int = Field(
+        default=5,
+        ge=1,
+        description="spacings of the grid modules for each orientation; larger: fewer side lobes, "
+        "more neurons",
+    )
     length_scale_m: float | tuple[float, ...] = Field(
-        1.0, description="larger: broader bumps, in all directions or each; larger spaces need it"
+        default=1.0,
+        description="width of the similarity of positions, one number or one for each axis; "
+        "larger: broader; a larger space needs a larger one",
     )
     reach_m: float | tuple[float, ...] = Field(
-        20.0, description="the robot stays in [-reach, reach] of where it starts"
+        default=20.0,
+        description="the robot stays in [-reach, reach] of its start, one number or one for each "
+        "axis; larger: a larger space, slower decoding",
     )
 
 
 class RoomIntegratorConfig(PathIntegratorConfig):
-    """The path integrator of a robot."""
+    """Path integrator of a robot: higher speeds."""
 
-    max_speed_m_s: float = Field(2.0, gt=0, description="faster is cut; larger: coarser rates")
+    max_speed_m_s: float = Field(
+        default=2.0,
+        gt=0,
+        description="largest speed represented; higher speeds are cut to it; larger: lower "
+        "resolution of speed",
+    )
 
 
 class SemanticConfig(SSPSLAMConfig):
-    """The semantic map of a brain: SSP-SLAM over rooms, and which landmarks it is told."""
+    """The semantic map of a brain: SSP-SLAM among rooms, and which landmarks it observes."""
 
     tier: Literal["algebraic", "rate", "spiking"] = Field(
-        "algebraic", description="vectors alone; rates of neurons; spikes"
+        default="algebraic",
+        description="how it is computed; algebraic: vectors, no neurons; rate: firing rates of "
+        "neurons; spiking: spikes",
     )
-    time_step_s: float = Field(0.05, gt=0, le=0.1, description="of the simulation; spikes: 0.001")
+    time_step_s: float = Field(
+        default=0.05,
+        gt=0,
+        le=0.1,
+        description="time step of the simulation; larger: faster, less exact; spiking needs 0.001",
+    )
     space: RoomSpaceConfig = RoomSpaceConfig()
     integrator: RoomIntegratorConfig = RoomIntegratorConfig()
-    vector_reach_m: float = Field(6.0, gt=0, description="how far object-vector cells reach")
+    vector_reach_m: float = Field(
+        default=6.0,
+        gt=0,
+        description="largest displacement that object-vector cells represent; larger: lower "
+        "resolution",
+    )
     landmarks: tuple[Literal["given", "markers", "views"], ...] = Field(
-        ("given",),
+        default=("given",),
         min_length=1,
-        description="given: the source's; markers: ArUco or AprilTag in its pictures; views: each "
-        "known view is a landmark",
+        description="where landmarks come from; given: the source; markers: ArUco or AprilTag "
+        "markers in the images; views: each matched view is a landmark",
     )
     markers: str = Field(
-        "4X4_50", description="dictionary of markers, as OpenCV calls them after DICT_"
+        default="4X4_50", description="OpenCV's name of the marker dictionary, without DICT_"
     )
-    marker_size_m: float = Field(0.4, gt=0, description="side of a marker's black square")
+    marker_size_m: float = Field(
+        default=0.4,
+        gt=0,
+        description="side of a marker's black square; larger: the same marker in the image is "
+        "farther away",
+    )
     key_features: int = Field(
-        256, ge=16, description="length of a landmark's pointer; more: more landmarks told apart"
+        default=256,
+        ge=16,
+        description="length of a landmark's pointer; larger: more landmarks are told apart",
     )
     same_m: float = Field(
-        1.0, gt=0, description="a landmark without a name is the known one within this distance"
+        default=1.0,
+        gt=0,
+        description="distance within which an unnamed landmark is taken for a known one; larger: "
+        "fewer landmarks, more confusions",
     )
-    sigma_m: float = Field(0.15, gt=0, description="error of a place that a landmark tells")
+    sigma_m: float = Field(
+        default=0.15,
+        gt=0,
+        description="standard deviation of a position that a landmark gives; larger: landmarks "
+        "correct other cells less",
+    )
     heading_rate_hz: float = Field(
-        0.2, ge=0, description="how fast bearings of landmarks correct an integrated heading"
+        default=0.2,
+        ge=0,
+        description="rate at which bearings of known landmarks correct an integrated heading; "
+        "larger: faster, noisier",
     )
 
     @model_validator(mode="after")
     def _is_a_plane(self) -> Self:
         if self.space.dimension != 2:
-            raise ValueError(f"space.dimension is {self.space.dimension}; a brain lives in 2")
+            raise ValueError(
+                f"space.dimension is {self.space.dimension}; expected 2: a brain maps a plane"
+            )
         return self

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
+from neuroslam.cells.navigation import NavigationCells
+from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
+from neuroslam.cells.navigation import NavigationCells
+from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps, fields

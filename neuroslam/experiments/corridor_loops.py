@@ -173,7 +173,7 @@ def solve(graph: Graph, method: str) -> tuple[np.ndarray, np.ndarray]:
         sigma_m=graph.sigma_m,
         sigma_rad=graph.sigma_rad,
         confidence=graph.confidence,
-        doubtful=graph.is_match if method == "least_squares_robust" else None,
+        rejectable=graph.is_match if method == "least_squares_robust" else None,
     )
     return poses, report.weights > 0
 

@@ -13,13 +13,13 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from neuroslam.cells.head_direction import (
+    CompassReading,
     HeadDirectionCells,
     HeadDirectionConfig,
-    Heard,
     bump_at,
-    tuning_width,
 )
 from neuroslam.cells.speed import SpeedCellConfig, SpeedCells, speed_score
+from neuroslam.evaluation.tuning import tuning_width
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.figures.heading import (
     Bump,
@@ -187,7 +187,7 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
     for sensed, heading, heard in zip(rates + gyro, true, true + compass, strict=True):
         motion = Motion(0.0, torch.from_numpy(sensed), DT_S)
         alone.advance(motion)
-        led.advance(motion, Heard(torch.from_numpy(heard)))
+        led.advance(motion, CompassReading(torch.from_numpy(heard)))
         errors["alone"].append(alone.heading_rad.numpy() - heading)
         errors["led"].append(led.heading_rad.numpy() - heading)
     few = slice(None, _WITH_VIEWS)
@@ -263,7 +263,7 @@ def persistence(out: Path, minutes: float) -> list[dict[str, Any]]:
     cells = HeadDirectionCells(batch=len(start) + 1)
     noise = torch.rand(HeadDirectionConfig().n, generator=torch.Generator().manual_seed(0))
     bumps = bump_at(cells.ring, torch.from_numpy(start))
-    cells.take(torch.cat([bumps, noise[None].to(bumps)]))
+    cells.set_activity(torch.cat([bumps, noise[None].to(bumps)]))
     still = Motion(0.0, torch.zeros(len(start) + 1, dtype=torch.float64), DT_S)
     headings, widths = [], []
     for k in range(round(60.0 * minutes / DT_S)):

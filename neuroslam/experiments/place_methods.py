@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from neuroslam.cells.boundary_vectors import Wall
-from neuroslam.cells.navigation import NavigationCells, NavigationEstimate
+from neuroslam.cells.navigation import NavigationCells
+from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.config import BrainConfig, PoseCellConfig, WallMemoryConfig
 from neuroslam.evaluation.ratemap import responding

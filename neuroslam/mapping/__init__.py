@@ -1,4 +1,4 @@
-"""The graph of places, how it is made consistent, and ways through it."""
+"""The experience map: a graph of experiences, its solvers, and paths through it."""
 
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.planning import Plan, quickest_path

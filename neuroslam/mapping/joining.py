@@ -1,4 +1,4 @@
-"""How the maps of two sessions become one: places moved, links rerouted, ids renamed."""
+"""Merge of two maps: partial experiences moved, their links rerouted, ids renamed."""
 
 import math
 
@@ -17,10 +17,10 @@ _PROVENANCE = ("first_frame", "session", "number")
 def merge_maps(loaded: State, partial: State, join: Join) -> State:
     """Place the partial experiences in the loaded map and reroute all their links.
 
-    Loaded experiences and links come first. What a link measured stays; where an end becomes
-    part of an experience that faces elsewhere, it is told relative to that. A link between
-    experiences that the loaded map has linked already is left out. Position in the map, time
-    and goals are those of the session that goes on.
+    Loaded experiences and links come first. Links keep their measurements; where an end becomes
+    part of an experience with another heading, the link becomes relative to that heading. A link
+    between experiences that the loaded map has linked already is left out. Pose, time and goals
+    are those of the partial session, which goes on.
 
     (Multisession RatSLAM, Eqs. 13-17. All links of the matched experience are rerouted here;
     the paper speaks of the last one only.)
@@ -36,7 +36,7 @@ def merge_maps(loaded: State, partial: State, join: Join) -> State:
     moved = {
         "pose": pose[kept],
         "cell": cell[kept],
-        # A place without a view has -1, which finds the last entry: none again.
+        # An experience without a view has -1, which indexes the last entry: none again.
         "template": np.append(join.views, NO_TEMPLATE)[old["experiences.template"][kept]],
         **{name: old[f"experiences.{name}"][kept] for name in _PROVENANCE},
     }
@@ -74,10 +74,11 @@ def _append(loaded: State, table: str, rows: dict[str, np.ndarray]) -> State:
 
 
 def links_kept(partial: Links, loaded: Links, join: Join) -> np.ndarray:
-    """Tell which partial links a merge keeps: those that join places not yet linked."""
+    """Return which partial links a merge keeps: those between experiences not yet linked."""
     source, target = join.experiences[partial.source], join.experiences[partial.target]
-    there = _undirected(loaded.source, loaded.target)
-    return (source != target) & ~np.isin(_undirected(source, target), there)
+    linked = np.isin(_undirected(source, target), _undirected(loaded.source, loaded.target))
+    kept: np.ndarray = (source != target) & ~linked
+    return kept
 
 
 def _rerouted(old: dict[str, np.ndarray], known: dict[str, np.ndarray], join: Join) -> Links:
@@ -96,18 +97,20 @@ def _rerouted(old: dict[str, np.ndarray], known: dict[str, np.ndarray], join: Jo
 
 
 def _turned(angle_rad: np.ndarray, by_rad: np.ndarray) -> np.ndarray:
-    return np.where(by_rad == 0.0, angle_rad, wrap_angles(angle_rad + by_rad))  # to the last bit
+    # An angle that does not turn stays equal to the last bit.
+    return np.where(by_rad == 0.0, angle_rad, wrap_angles(angle_rad + by_rad))
 
 
 def _undirected(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """One number for each pair of ids, whichever way it is named."""
-    return (np.maximum(source, target) << 32) | np.minimum(source, target)
+    """Return one key for each pair of ids, in either order."""
+    key: np.ndarray = (np.maximum(source, target) << 32) | np.minimum(source, target)
+    return key
 
 
 def _aliases(
     old: dict[str, np.ndarray], known: dict[str, np.ndarray], join: Join
 ) -> dict[str, np.ndarray]:
-    """Aliases of the partial map, those that this merge makes, without those known already."""
+    """Return the partial aliases and those of this merge that the loaded map does not have."""
     before = {name: old[f"aliases.{name}"] for name in ALIAS_COLUMNS}
     into = before["experience"]
     before["turn_rad"] = wrap_angles(before["turn_rad"] + join.turns_rad[into])
@@ -115,7 +118,7 @@ def _aliases(
     gone = np.flatnonzero((join.experiences < join.n_experiences) | (join.turns_rad != 0.0))
     made = {name: old[f"experiences.{name}"][gone] for name in _PROVENANCE}
     made |= {"experience": join.experiences[gone], "turn_rad": join.turns_rad[gone]}
-    fresh = ~np.isin(origin_key(made), origin_key(before))  # an alias of itself was turned already
+    fresh = ~np.isin(origin_key(made), origin_key(before))  # an earlier alias has been turned above
     both = {name: np.concatenate([before[name], made[name][fresh]]) for name in ALIAS_COLUMNS}
     there = np.concatenate(
         [

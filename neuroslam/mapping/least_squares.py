@@ -1,4 +1,4 @@
-r"""Sparse pose-graph optimisation: the map whose links agree best, and which loops to disbelieve.
+r"""Sparse pose-graph optimisation, with rejection of false loop closures.
 
 A link from :math:`s` to :math:`t` measures :math:`z = (d\cos h, d\sin h, f)`: distance, heading and
 facing of the target as seen from the source. Its residual, in units of its standard deviations, is
@@ -6,10 +6,10 @@ facing of the target as seen from the source. Its residual, in units of its stan
 .. math:: r = \begin{pmatrix} (R(\theta_s)^\top (p_t - p_s) - z_{xy}) / \sigma_m \\
           \operatorname{wrap}(\theta_t - \theta_s - f) / \sigma_{rad} \end{pmatrix}
 
-and the map sought is the one of least :math:`\sum w \lVert r \rVert^2`.
+and the solution minimises :math:`\sum w \lVert r \rVert^2`.
 """
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import sparse
@@ -20,33 +20,33 @@ from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angles
 
 FIRST_TRIED = 16
-"""Doubtful links that are tried at first."""
+"""Rejectable links that the first stage tests."""
 
 GROWTH = 1.5
-"""Every later stage tries so many times more of them."""
+"""Factor by which each later stage tests more of them."""
 
 ROUNDS = 10
-"""Times that a stage judges its links at most; it ends when the verdicts stay the same."""
+"""Largest number of rounds of a stage; it ends when no link changes between in and out."""
 
 MAPS_SAMPLED = 32
-"""Maps that are drawn to learn how uncertain the map is."""
+"""Samples of the map from which its covariance is estimated."""
 
 FALSE_ALARM = 0.01
-"""Share of the right links that the gate turns away."""
+"""Share of correct links that the gate rejects."""
 
 
 LEAST_GAIN = 1e-9
-"""A step that lowers the cost by a smaller share of it is the last."""
+"""Relative decrease of the cost below which iteration ends."""
 
 
 class LeastSquaresReport(NamedTuple):
-    r"""How :func:`solve_pose_graph` went.
+    r"""Report of :func:`solve_pose_graph`.
 
     Attributes:
-        iterations: Linear systems solved for a step.
+        iterations: Number of linear systems solved.
         cost: :math:`\sum w \lVert r \rVert^2` at the end.
-        weights: :math:`w` of every link, shape ``(links,)``; 0 where it was disbelieved.
-        converged: The last step was below the tolerance, or gained next to nothing.
+        weights: :math:`w` of every link, shape ``(links,)``; 0 where it was rejected.
+        converged: The last step was below the tolerance, or lowered the cost by next to nothing.
     """
 
     iterations: int
@@ -62,7 +62,7 @@ class _Links(NamedTuple):
     scale: np.ndarray  # (links, 3): 1 / sigma; 0 for a facing that was not measured
 
     def pick(self, which: np.ndarray) -> Self:
-        return self._make(field[which] for field in self)
+        return type(self)(*(field[which] for field in self))
 
 
 def solve_pose_graph(
@@ -76,35 +76,35 @@ def solve_pose_graph(
     sigma_m: float | np.ndarray = 1.0,
     sigma_rad: float | np.ndarray = 1.0,
     confidence: np.ndarray | None = None,
-    doubtful: np.ndarray | None = None,
+    rejectable: np.ndarray | None = None,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
     seed: int = 0,
 ) -> tuple[np.ndarray, LeastSquaresReport]:
-    r"""Find the poses that agree best with all links; the first pose stays where it is.
+    r"""Find the poses that minimise the residuals of all links; the first pose is fixed.
 
-    Levenberg-Marquardt on the sparse normal equations. Where links are ``doubtful``, they are
-    admitted by degrees: the most confident first (of equals, those whose ends the map knows best),
-    1.5 times more in every round. One is believed while
+    Levenberg-Marquardt on the sparse normal equations. Links that are ``rejectable`` are added in
+    stages: the most confident first (of equals, those whose ends are best known), 1.5 times more
+    in every stage. A link is an inlier while
     :math:`r^\top (I + \Sigma)^{-1} r` is below the 99 % point of :math:`\chi^2`, with
-    :math:`\Sigma` the covariance that its residual has for the uncertainty of the map itself,
-    estimated from sampled maps. So a link is judged by the better ones before it, a loose map is
-    generous, and every round judges all of them anew.
+    :math:`\Sigma` the covariance of its residual that follows from the uncertainty of the map,
+    estimated from sampled maps. So a link is tested against the more confident ones, an uncertain
+    map tolerates larger residuals, and every round tests all links again.
 
     Args:
-        poses: Where to begin, x, y in metres and heading in radians, shape ``(n, 3)``.
+        poses: Initial poses, x, y in metres and heading in radians, shape ``(n, 3)``.
         source: Pose at which each link begins, shape ``(links,)``.
         target: Pose at which it ends.
         distance_m: Distance from source to target.
         heading_rad: Direction of the target, relative to the source's heading.
         facing_rad: Heading of the target relative to the source's; NaN where it is unknown, then
-            the link says only where the target is.
-        sigma_m: Standard deviation of a link's position, one or one a link.
+            the link constrains the position of the target only.
+        sigma_m: Standard deviation of a link's position, one number or one for each link.
         sigma_rad: Standard deviation of its facing.
-        confidence: Weight of each link in [0, 1], and for doubtful ones the order of admission.
-        doubtful: Which links may be disbelieved, boolean; none by default.
-        max_iterations: Steps of the final solution, and of each round of admission.
-        tolerance: Largest step (m, rad) that counts as standing still.
+        confidence: Weight of each link in [0, 1]; rejectable links are added in its order.
+        rejectable: Which links may be rejected, boolean; none by default.
+        max_iterations: Largest number of steps of the final solution, and of each round.
+        tolerance: Largest step (m, rad) of a solution that has converged.
         seed: Seed of the sampled maps.
 
     Returns:
@@ -114,17 +114,17 @@ def solve_pose_graph(
         MapError: If a link ends outside the map, or a number is not finite.
 
     Example:
-        >>> heap = np.zeros((4, 3))  # four poses on one spot, a quarter turn apart
-        >>> heap[:, 2] = [0.0, np.pi / 2, np.pi, 3 * np.pi / 2]
+        >>> start = np.zeros((4, 3))  # four poses at one position, a quarter turn apart
+        >>> start[:, 2] = [0.0, np.pi / 2, np.pi, 3 * np.pi / 2]
         >>> turn = np.full(4, np.pi / 2)
         >>> solved, report = solve_pose_graph(
-        ...     heap, np.arange(4), np.array([1, 2, 3, 0]), np.ones(4), np.zeros(4), turn
+        ...     start, np.arange(4), np.array([1, 2, 3, 0]), np.ones(4), np.zeros(4), turn
         ... )
         >>> solved[2, :2].round(6).tolist(), round(report.cost, 9)
         ([1.0, 1.0], 0.0)
     """
     poses = np.array(poses, dtype=np.float64)
-    with np.errstate(invalid="ignore"):  # _check says which link is infinite
+    with np.errstate(invalid="ignore"):  # _check names the link that is not finite
         ahead, aside = distance_m * np.cos(heading_rad), distance_m * np.sin(heading_rad)
     measured = np.stack([ahead, aside, facing_rad], axis=1)
     links = _Links(source, target, measured, np.empty_like(measured))
@@ -135,11 +135,13 @@ def solve_pose_graph(
     _check(poses, links)
     weights = np.ones(len(source)) if confidence is None else np.array(confidence, dtype=np.float64)
     steps = 0
-    if doubtful is not None and doubtful.any():
-        poses, weights, steps = _admit(poses, links, weights, doubtful, max_iterations, seed)
-    believed = weights > 0
+    if rejectable is not None and rejectable.any():
+        poses, weights, steps = _select_inliers(
+            poses, links, weights, rejectable, max_iterations, seed
+        )
+    inlier = weights > 0
     poses, cost, last_steps, converged = _minimise(
-        poses, links.pick(believed), weights[believed], max_iterations, tolerance
+        poses, links.pick(inlier), weights[inlier], max_iterations, tolerance
     )
     poses[1:, 2] = wrap_angles(poses[1:, 2])
     return poses, LeastSquaresReport(steps + last_steps, cost, weights, converged)
@@ -164,13 +166,14 @@ def _residuals(poses: np.ndarray, links: _Links) -> np.ndarray:
     theta = poses[links.source, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     dx, dy, turn = (poses[links.target] - poses[links.source]).T
-    seen = np.stack([cos * dx + sin * dy, cos * dy - sin * dx, turn], axis=1) - links.measured
-    seen[:, 2] = wrap_angles(seen[:, 2])
-    return seen * links.scale
+    off = np.stack([cos * dx + sin * dy, cos * dy - sin * dx, turn], axis=1) - links.measured
+    off[:, 2] = wrap_angles(off[:, 2])
+    residuals: np.ndarray = off * links.scale
+    return residuals
 
 
 def _jacobian(poses: np.ndarray, links: _Links) -> sparse.csr_array:
-    """Derivative of the residuals, ``(3 links, 3 n)``; the columns of the first pose are zero."""
+    """Return the derivative of the residuals, ``(3 links, 3 n)``; zero for the first pose."""
     theta = poses[links.source, 2]
     dx, dy = (poses[links.target, :2] - poses[links.source, :2]).T
     by_x, by_y, by_turn = links.scale.T
@@ -194,11 +197,11 @@ def _jacobian(poses: np.ndarray, links: _Links) -> sparse.csr_array:
     return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
-def _factor(normal: sparse.csc_array, damping: float) -> SuperLU:
-    """Factorise the damped normal equations.
+def _factor(normal: Any, damping: float) -> SuperLU:  # noqa: ANN401 - scipy's products are untyped
+    """Factorise the damped normal equations, a sparse matrix.
 
-    The tiny constant on the diagonal holds still what no link holds: the first pose, and parts of
-    the map that are not connected to it.
+    The tiny constant on the diagonal fixes what no link fixes: the first pose, and parts of the map
+    that are not connected to it.
     """
     diagonal = normal.diagonal()
     held = normal + sparse.diags_array(damping * diagonal + 1e-12 * max(diagonal.max(), 1.0))
@@ -210,49 +213,53 @@ def _factor(normal: sparse.csc_array, damping: float) -> SuperLU:
     )
 
 
-def _turn_then_place(poses: np.ndarray, links: _Links) -> np.ndarray:
-    """Solve for the headings alone, then for the places: two linear problems, a good beginning."""
+def _headings_then_positions(poses: np.ndarray, links: _Links) -> np.ndarray:
+    """Solve for the headings, then for the positions: two linear problems, a good initial guess."""
     n = len(poses)
     ends = np.concatenate([links.source, links.target])
     rows = np.tile(np.arange(len(links.source)), 2)
     signs = np.repeat([-1.0, 1.0], len(links.source)) * (ends > 0)
     difference = sparse.csr_array((signs, (rows, ends)), shape=(len(links.source), n))
-    seen_from, seen = poses[links.source], links.measured
+    start, measured = poses[links.source], links.measured
 
     def least(values: np.ndarray, scale: np.ndarray) -> np.ndarray:
         scaled = sparse.diags_array(scale) @ difference
-        return _factor(scaled.T @ scaled, 0.0).solve(scaled.T @ (values.T * scale).T)
+        solution: np.ndarray = _factor(scaled.T @ scaled, 0.0).solve(
+            scaled.T @ (values.T * scale).T
+        )
+        return solution
 
-    # sought as corrections of the poses, so that whole turns and the first pose stay as they are
-    turn = wrap_angles(seen[:, 2] - poses[links.target, 2] + seen_from[:, 2])
+    # Solved as corrections of the poses, so that whole turns and the first pose stay.
+    turn = wrap_angles(measured[:, 2] - poses[links.target, 2] + start[:, 2])
     theta = poses[:, 2] + least(turn, links.scale[:, 2])
     cos, sin = np.cos(theta[links.source]), np.sin(theta[links.source])
-    away = np.stack([cos * seen[:, 0] - sin * seen[:, 1], sin * seen[:, 0] + cos * seen[:, 1]], 1)
-    away -= poses[links.target, :2] - seen_from[:, :2]
-    places = poses[:, :2] + least(away, links.scale[:, 0])
-    return np.column_stack([places, theta])
+    ahead, aside = measured[:, 0], measured[:, 1]
+    away = np.stack([cos * ahead - sin * aside, sin * ahead + cos * aside], 1)
+    away -= poses[links.target, :2] - start[:, :2]
+    positions = poses[:, :2] + least(away, links.scale[:, 0])
+    return np.column_stack([positions, theta])
 
 
 def _minimise(
     poses: np.ndarray, links: _Links, weights: np.ndarray, max_iterations: int, tolerance: float
 ) -> tuple[np.ndarray, float, int, bool]:
-    """Levenberg-Marquardt; returns poses, cost, steps and whether it came to an end."""
+    """Run Levenberg-Marquardt; return poses, cost, number of steps, and whether it converged."""
     links = links._replace(scale=links.scale * np.sqrt(weights)[:, None])
     if not len(links.source):
         return poses, 0.0, 0, True
     poses, residuals, cost = min(
-        (_weighed(start, links) for start in (poses, _turn_then_place(poses, links))),
-        key=lambda weighed: weighed[2],
+        (_evaluated(start, links) for start in (poses, _headings_then_positions(poses, links))),
+        key=lambda evaluated: evaluated[2],
     )
     damping, steps, converged = 1e-9, 0, False
     while not converged and steps < max_iterations:
         jacobian = _jacobian(poses, links)
         normal, slope = jacobian.T @ jacobian, jacobian.T @ residuals.ravel()
-        worse = True
+        worse, moved = True, (poses, residuals, cost)
         while worse and not converged and steps < max_iterations:
             steps += 1
             step = _factor(normal, damping).solve(slope).reshape(-1, 3)
-            moved = _weighed(poses - step, links)
+            moved = _evaluated(poses - step, links)
             gain = cost - moved[2]
             worse = not gain >= 0.0
             converged = bool(np.abs(step).max() <= tolerance) or 0.0 <= gain <= LEAST_GAIN * cost
@@ -262,38 +269,38 @@ def _minimise(
     return poses, cost, steps, converged
 
 
-def _weighed(poses: np.ndarray, links: _Links) -> tuple[np.ndarray, np.ndarray, float]:
+def _evaluated(poses: np.ndarray, links: _Links) -> tuple[np.ndarray, np.ndarray, float]:
     residuals = _residuals(poses, links)
     return poses, residuals, float(np.vdot(residuals, residuals))
 
 
-def _admit(
+def _select_inliers(
     poses: np.ndarray,
     links: _Links,
     confidence: np.ndarray,
-    doubtful: np.ndarray,
+    rejectable: np.ndarray,
     max_iterations: int,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Admit doubtful links by degrees; returns poses, weights (0: disbelieved) and steps."""
+    """Add rejectable links in stages; return poses, weights (0: rejected) and number of steps."""
     generator = np.random.default_rng(seed)
-    weights = np.where(doubtful, 0.0, confidence)
+    weights = np.where(rejectable, 0.0, confidence)
     gate = chdtri(2.0 + (links.scale[:, 2] > 0), FALSE_ALARM)
-    candidates = np.flatnonzero(doubtful)
-    steps, n_tried = 0, 0
-    while n_tried < len(candidates):
-        n_tried = min(int(GROWTH * n_tried) + FIRST_TRIED, len(candidates))
+    candidates = np.flatnonzero(rejectable)
+    steps, n_tested = 0, 0
+    while n_tested < len(candidates):
+        n_tested = min(int(GROWTH * n_tested) + FIRST_TRIED, len(candidates))
         for _ in range(ROUNDS):
-            spread = _sampled_covariance(poses, links, weights, candidates, generator)
-            looseness = np.trace(spread, axis1=1, axis2=2)
-            order = np.lexsort([looseness, -confidence[candidates]])[:n_tried]
-            tried = candidates[order]
-            residuals = _residuals(poses, links.pick(tried))[..., None]
-            surprise = residuals * np.linalg.solve(spread[order] + np.eye(3), residuals)
-            believed = surprise.sum(axis=(1, 2)) < gate[tried]
+            covariance = _sampled_covariance(poses, links, weights, candidates, generator)
+            variance = np.trace(covariance, axis1=1, axis2=2)
+            order = np.lexsort([variance, -confidence[candidates]])[:n_tested]
+            tested = candidates[order]
+            residuals = _residuals(poses, links.pick(tested))[..., None]
+            squares = residuals * np.linalg.solve(covariance[order] + np.eye(3), residuals)
+            inlier = squares.sum(axis=(1, 2)) < gate[tested]
             before = weights.copy()
             weights[candidates] = 0.0
-            weights[tried[believed]] = confidence[tried[believed]]
+            weights[tested[inlier]] = confidence[tested[inlier]]
             if np.array_equal(weights, before):
                 break
             chosen = weights > 0
@@ -311,15 +318,19 @@ def _sampled_covariance(
     wanted: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    r"""Covariance of the wanted residuals for the uncertainty of the map, ``(wanted, 3, 3)``.
+    r"""Return the covariance of some residuals due to the uncertainty of the map.
 
     With :math:`H = J^\top J`, :math:`x = H^{-1} J^\top \epsilon` of white :math:`\epsilon` has
-    covariance :math:`H^{-1}`: a few draws cost one factorisation, however many links ask.
+    covariance :math:`H^{-1}`: a few samples cost one factorisation for any number of links.
+
+    Returns:
+        Shape ``(wanted, 3, 3)``.
     """
-    believed = links.pick(weights > 0)
-    believed.scale[:] *= np.sqrt(weights[weights > 0])[:, None]
-    jacobian = _jacobian(poses, believed)
-    white = generator.standard_normal((jacobian.shape[0], MAPS_SAMPLED))
+    inliers = links.pick(weights > 0)
+    inliers.scale[:] *= np.sqrt(weights[weights > 0])[:, None]
+    jacobian = _jacobian(poses, inliers)
+    white = generator.standard_normal((3 * len(inliers.source), MAPS_SAMPLED))
     maps = _factor(jacobian.T @ jacobian, 0.0).solve(jacobian.T @ white)
-    drawn = (_jacobian(poses, links.pick(wanted)) @ maps).reshape(-1, 3, MAPS_SAMPLED)
-    return drawn @ drawn.transpose(0, 2, 1) / MAPS_SAMPLED
+    samples = (_jacobian(poses, links.pick(wanted)) @ maps).reshape(-1, 3, MAPS_SAMPLED)
+    covariance: np.ndarray = samples @ samples.transpose(0, 2, 1) / MAPS_SAMPLED
+    return covariance

@@ -1,4 +1,4 @@
-"""Which recognised places of two maps can be believed: those that agree on how the maps lie."""
+"""Matched pairs of experiences of two maps, grouped by the alignment that they agree on."""
 
 from typing import NamedTuple
 
@@ -12,13 +12,13 @@ from neuroslam.state.match import Pairs
 
 
 class Tolerance(NamedTuple):
-    """How far two places may be from where the rest has them.
+    """Differences at which two matched pairs still agree on an alignment.
 
     Attributes:
-        near_m: Pairs farther apart than this, on either map, say nothing about each other.
-        place_m: Size of a place: so far two views of one place may be apart.
-        drift: Share of the way between two pairs by which odometry may be off.
-        turn_rad: Difference of headings.
+        near_m: Pairs farther apart than this are not compared: odometry drifts too much.
+        place_m: Distance allowed between two experiences with the same view.
+        drift: Error of odometry allowed, as a share of the distance between two pairs.
+        turn_rad: Difference of rotation allowed.
     """
 
     near_m: float
@@ -30,27 +30,27 @@ class Tolerance(NamedTuple):
 def agreeing(
     pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray, tolerance: Tolerance
 ) -> list[np.ndarray]:
-    r"""Group the pairs that agree with each other on how one map lies in the other.
+    r"""Group the pairs that agree with each other on the alignment of two maps.
 
-    Pairs :math:`(z_i, u_i)` and :math:`(z_j, u_j)` agree if the way from :math:`z_i` to
+    Pairs :math:`(z_i, u_i)` and :math:`(z_j, u_j)` agree if the displacement from :math:`z_i` to
     :math:`z_j` is that from :math:`u_i` to :math:`u_j`,
 
     .. math:: \lVert R(-\phi_i)(z_j - z_i) - R(-\psi_i)(u_j - u_i) \rVert
               \le \epsilon + \delta \lVert z_j - z_i \rVert
 
-    with :math:`\phi_i` the heading at :math:`z_i` and :math:`\psi_i` that at :math:`u_i` turned by
-    what was seen; and if the headings turn alike. Only ways of at most ``near_m`` are compared, for
-    over longer ones two maps may well disagree. A group holds each partial place once, and is
-    ordered as given.
+    with :math:`\phi_i` the heading at :math:`z_i` and :math:`\psi_i` that at :math:`u_i` plus
+    the heading difference of the views; and if both imply the same rotation. Only pairs within
+    ``near_m`` are compared, for odometry drifts over longer distances. A group contains each
+    partial experience once, in the order of ``pairs``.
 
     Args:
-        pairs: What was recognised; a place may be in several.
+        pairs: Matched pairs; an experience may be in several.
         partial_poses: x, y in metres and heading in radians, ``(n, 3)``.
         loaded_poses: The same of the loaded map, ``(m, 3)``.
-        tolerance: What is still alike.
+        tolerance: Differences allowed.
 
     Returns:
-        Numbers of the pairs of each group, the group of most places first.
+        Indices of the pairs of each group, the group with most experiences first.
 
     Example:
         >>> line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
@@ -65,12 +65,12 @@ def agreeing(
     i, j = cKDTree(z[:, :2]).query_pairs(tolerance.near_m, output_type="ndarray").T
     apart = np.linalg.norm(z[j, :2] - z[i, :2], axis=1)
     allowed = tolerance.place_m + tolerance.drift * apart
-    facing = u[:, 2] + pairs.turn_rad  # heading of the partial place, in the loaded map
+    facing = u[:, 2] + pairs.turn_rad  # heading of the partial experience, in the loaded map
     there = _seen_from(z[i], z[i, 2], z[j])
     here = _seen_from(u[i], facing[i], u[j])
     turn = np.abs(wrap_angles((facing - z[:, 2])[i] - (facing - z[:, 2])[j]))
     agree = np.linalg.norm(there - here, axis=1) <= allowed
-    # From the other end too: a wrong heading shows only where it is looked along.
+    # From the other end too: a wrong heading shows only from its own experience.
     there, here = _seen_from(z[j], z[j, 2], z[i]), _seen_from(u[j], facing[j], u[i])
     agree &= np.linalg.norm(there - here, axis=1) <= allowed
     agree &= (turn <= tolerance.turn_rad) & (pairs.partial[i] != pairs.partial[j])
@@ -78,7 +78,7 @@ def agreeing(
     joined = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
     _, label = connected_components(joined, directed=False)
     support = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
-    # Of one partial place, in one group, the pair that most agree with, then the most alike.
+    # For a partial experience keep, in a group, the pair with most support, then least error.
     order = np.lexsort((np.arange(n), pairs.error, -support, pairs.partial, label))
     first = np.ones(n, dtype=bool)
     first[1:] = (np.diff(label[order]) != 0) | (np.diff(pairs.partial[order]) != 0)
@@ -87,8 +87,10 @@ def agreeing(
     return sorted(groups, key=lambda group: (-n_places(pairs.pick(group)), group[0]))
 
 
-def misfits_m(pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray) -> np.ndarray:
-    """Lay one map on the other by the first pair; how far apart do the places of each pair lie?
+def pair_residuals_m(
+    pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray
+) -> np.ndarray:
+    """Align two maps by the first pair; return the distance between the ends of each pair, metres.
 
     Args:
         pairs: At least one.
@@ -97,17 +99,18 @@ def misfits_m(pairs: Pairs, partial_poses: np.ndarray, loaded_poses: np.ndarray)
 
     Example:
         >>> line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-        >>> misfits_m(Pairs.of([(0, 0, 0, 0), (1, 2, 0, 0)]), line, line).tolist()
+        >>> pair_residuals_m(Pairs.of([(0, 0, 0, 0), (1, 2, 0, 0)]), line, line).tolist()
         [0.0, 1.0]
     """
     z, u = partial_poses[pairs.partial], loaded_poses[pairs.loaded]
     facing = np.full(len(z), u[0, 2] + pairs.turn_rad[0])
     there = _seen_from(z[:1], np.full(len(z), z[0, 2]), z)
-    return np.linalg.norm(there - _seen_from(u[:1], facing, u), axis=1)
+    distances: np.ndarray = np.linalg.norm(there - _seen_from(u[:1], facing, u), axis=1)
+    return distances
 
 
 def n_places(pairs: Pairs) -> int:
-    """Count the places of which both maps have another: standing still confirms nothing."""
+    """Count the pairs with distinct experiences on both maps: standing still confirms nothing."""
     return min(len(np.unique(pairs.partial)), len(np.unique(pairs.loaded)))
 
 

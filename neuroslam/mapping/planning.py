@@ -1,4 +1,4 @@
-"""The quickest and the shortest ways through a map."""
+"""Quickest and shortest paths through a map."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from scipy.sparse.csgraph import dijkstra
 
 
 class Plan(NamedTuple):
-    """A way through the map.
+    """A path through the map.
 
     Attributes:
-        path: Experiences from start to goal, both included; empty if there is no way.
-        duration_s: Time the way took when it was travelled; infinite if there is none.
-        reason: Why there is no way; empty if there is one.
+        path: Experiences from start to goal, both included; empty if there is no path.
+        duration_s: Sum of the durations of its links; infinite if there is no path.
+        reason: Why there is no path; empty if there is one.
     """
 
     path: list[int]
@@ -26,13 +26,13 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
 
     Args:
         links: ``source``, ``target``, ..., ``duration_s`` last, as in
-            :class:`neuroslam.mapping.experience.Links`.
+            :class:`neuroslam.mapping.tables.Links`.
         n: Number of experiences.
         start: Id to start from.
         goal: Id to reach.
 
     Returns:
-        The plan; an unreachable goal is said so in ``reason``, nothing is raised.
+        The plan; of an unreachable goal it has the ``reason``, and nothing is raised.
 
     Example:
         >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
@@ -53,7 +53,7 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
 
 
 def shortest_path_lengths(links: tuple[np.ndarray, ...], n: int, start: int) -> np.ndarray:
-    """Find how far it is to every experience over links, in both directions (Dijkstra).
+    """Return the shortest-path length to every experience, links in both directions (Dijkstra).
 
     Args:
         links: ``source``, ``target``, ``distance_m``, ..., as for :func:`quickest_path`.
@@ -61,18 +61,20 @@ def shortest_path_lengths(links: tuple[np.ndarray, ...], n: int, start: int) -> 
         start: Id to start from.
 
     Returns:
-        Metres, ``(n,)``; infinite where no links lead.
+        Metres, ``(n,)``; infinite where there is no path.
 
     Example:
         >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
         >>> shortest_path_lengths(links, 3, 2).tolist()
         [6.0, 1.0, 0.0]
     """
-    return dijkstra(_graph(*links[:3], n), indices=start)
+    source, target, distance_m = links[:3]
+    lengths: np.ndarray = dijkstra(_graph(source, target, distance_m, n), indices=start)
+    return lengths
 
 
 def _graph(source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int) -> csr_array:
-    """Both directions of every link; csgraph takes a stored 0 for no edge, so none is 0."""
+    """Return links in both directions; weights are above 0, as csgraph reads 0 as no edge."""
     pairs = np.concatenate([source * n + target, target * n + source])
     weights = np.maximum(np.concatenate([weight, weight]), 1e-9)
     order = np.lexsort((weights, pairs))  # coo sums duplicates: keep the least of each pair

@@ -1,4 +1,4 @@
-r"""The paper's relaxation of the map, in its sequential order, without a loop over links.
+r"""RatSLAM's relaxation of the map: sequential, but computed without a Python loop over links.
 
 One loop visits the links in the order of their source, then of their number, and each visit moves
 both ends by a share of the link's error, in opposite directions [MW08, Eq. 8]:
@@ -7,23 +7,26 @@ both ends by a share of the link's error, in opposite directions [MW08, Eq. 8]:
           \qquad e = \operatorname{wrap}(\theta_t - \theta_s - f)
 
 and likewise for x and y, where the error is :math:`p_t - p_s - d\,(\cos, \sin)(\theta_s + h)`.
-A visit is linear in what it finds. Numbering the values that the poses pass through, two new ones a
-visit, makes a loop one sparse lower triangular system, the same for x, y and heading:
+A visit is linear in the values before it. If the values that poses pass through are numbered, two
+new ones a visit, a loop is one sparse lower triangular system, the same for x, y and heading:
 
 .. math:: \begin{pmatrix} s' \\ t' \end{pmatrix} = \begin{pmatrix} 1-\alpha & \alpha \\
           \alpha & 1-\alpha \end{pmatrix} \begin{pmatrix} s \\ t \end{pmatrix}
           + \alpha\,c \begin{pmatrix} -1 \\ 1 \end{pmatrix}
 
-with :math:`c` what the link says of its target relative to its source.
+with :math:`c` the displacement or heading change that the link measures.
 """
+
+from typing import Any
 
 import numpy as np
 import torch
 
-try:  # not public, but unchanged since 2008; _runs_in_order checks what is asked of it
+try:  # not public, but unchanged since 2008; _runs_in_order checks what is needed of it
     from scipy.sparse._sparsetools import csr_matvec, csr_matvecs
 except ImportError:  # pragma: no cover
-    csr_matvec = csr_matvecs = None
+    csr_matvec: Any = None
+    csr_matvecs: Any = None
 
 from neuroslam.geometry import TWO_PI, wrap_angles
 
@@ -38,9 +41,9 @@ def relax_sequentially(
     loops: int,
     correction: float,
 ) -> np.ndarray:
-    """Relax link by link: the definition, slow; :class:`Relaxation` does the same.
+    """Relax link by link: the definition, slow; :class:`Relaxation` gives the same.
 
-    Args as of :class:`Relaxation` and :meth:`Relaxation.run`; returns the poses.
+    Args as of :class:`Relaxation` and :meth:`Relaxation.run`. Return the poses.
 
     Example:
         >>> poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
@@ -70,9 +73,9 @@ def _substitute(
 ) -> None:
     """Add to ``values[n:]``, row after row, the sparse product with all ``values`` before the row.
 
-    scipy's product adds into its output one row after the other. With its own input as output, a
-    row sees the rows before it, which is forward substitution: twice as fast as SuperLU's, and
-    nothing to factorise.
+    scipy's product adds to its output row after row. If the output is its own input, each row
+    reads the rows before it: forward substitution, twice as fast as SuperLU's and without a
+    factorisation.
     """
     if not IN_ORDER:
         for i, (first, second) in enumerate(columns.reshape(-1, 2)):
@@ -87,21 +90,21 @@ def _substitute(
 
 
 def _runs_in_order() -> bool:
-    """Whether this scipy's products, given their input as output, substitute forward."""
+    """Return whether this scipy's products substitute forward if output and input are one."""
     if csr_matvec is None or csr_matvecs is None:
         return False
     rows, columns = np.array([0, 1, 2], np.int32), np.array([0, 1], np.int32)
     one, two = np.array([1.0, 0.0, 0.0]), np.array([[1.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
     csr_matvec(2, 3, rows, columns, np.full(2, 2.0), one, one[1:])
     csr_matvecs(2, 3, 2, rows, columns, np.full(2, 2.0), two.ravel(), two.ravel()[2:])
-    return one.tolist() == [1, 2, 4] and two.tolist() == [[1, 3], [2, 6], [4, 12]]
+    return bool(one.tolist() == [1, 2, 4] and two.tolist() == [[1, 3], [2, 6], [4, 12]])
 
 
-_REST_EVERY = 20
-"""Loops between two looks at whether the map is at rest; the last is always looked at."""
+_CHECK_EVERY = 20
+"""Loops between two checks for convergence; the last loop is always checked."""
 
 IN_ORDER = _runs_in_order()
-"""Whether this scipy runs in order; if not, :class:`Relaxation` gives the same, slowly."""
+"""Whether this scipy substitutes forward; if not, :class:`Relaxation` is slower, not different."""
 
 
 class Relaxation:
@@ -113,7 +116,7 @@ class Relaxation:
         distance_m: Distance from source to target.
         heading_rad: Direction of the target, relative to the source's heading.
         facing_rad: Heading of the target relative to the source's; NaN where it is unknown, then
-            the link moves places only.
+            the link moves positions only.
         n: Number of poses.
 
     Example:
@@ -163,36 +166,36 @@ class Relaxation:
     def run(
         self, poses: np.ndarray, loops: int, correction: float, tolerance: float = 0.0
     ) -> tuple[np.ndarray, float]:
-        """Relax until the map is at rest, at most ``loops`` times.
+        """Relax until the map has converged, at most ``loops`` times.
 
-        Links that contradict each other pull for ever, each undoing what the other did. So rest is
-        that no pose ends a loop elsewhere than it began it, not that no link corrects.
+        Links that contradict each other never stop correcting: each undoes what the other did. So
+        the map has converged if no pose moves over a whole loop.
 
         Args:
             poses: x, y in metres and heading in radians, shape ``(n, 3)``; not altered.
             loops: Largest number of loops.
             correction: Share of its error by which a link moves each of its ends, in (0, 0.5].
-            tolerance: The map is at rest if no pose moved farther (m, rad) in a loop.
+            tolerance: The map has converged if no pose moved farther (m, rad) in a loop.
 
         Returns:
-            The poses, headings in [-pi, pi), and how far the pose that moved most in the last loop
-            moved (m or rad; 0 if nothing was to do).
+            The poses, headings in [-pi, pi), and the largest movement of a pose in the last loop (m
+            or rad; 0 without loops or links).
         """
         n, n_links = self._n, len(self._source)
         moved = 0.0
         if loops == 0 or n_links == 0:
             return np.array(poses, dtype=np.float64), moved
         if correction != self._correction:
-            self._share(correction)
+            self._set_correction(correction)
         theta, xy = self._theta[:n], self._xy[:n]
         theta[:], xy[:] = poses[:, 2], poses[:, :2]
         facing = self._unwrapped_facing(theta[self._source], theta[self._target])
         for left in range(loops - 1, -1, -1):
             facing, new_theta, new_xy = self._loop(self._theta, self._xy, facing)
-            if left % _REST_EVERY == 0:  # to look costs a quarter of a loop of a small map
+            if left % _CHECK_EVERY == 0:  # a check costs a quarter of a loop of a small map
                 moved = float(max(np.abs(new_theta - theta).max(), np.abs(new_xy - xy).max()))
             theta[:], xy[:] = new_theta, new_xy
-            if left % _REST_EVERY == 0 and moved <= tolerance:
+            if left % _CHECK_EVERY == 0 and moved <= tolerance:
                 break
         theta -= TWO_PI * np.floor((theta + np.pi) / TWO_PI)
         return np.column_stack([xy, theta]), moved
@@ -200,26 +203,26 @@ class Relaxation:
     def _loop(
         self, theta: np.ndarray, xy: np.ndarray, facing: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fill in the values of one loop; returns the facings in force, headings and places."""
+        """Compute the values of one loop; return the facings used, new headings and positions."""
         facing = self._turn(theta, facing)
         bearing = theta.take(self._found_source)
         bearing += self._heading_rad
         away = torch.from_numpy(bearing)  # its cos and sin are thrice as fast as numpy's
         new = xy[self._n :].reshape(-1, 2, 2)
         for axis, along in enumerate((torch.cos(away), torch.sin(away))):
-            pull = along.numpy()
-            pull *= self._pull_m
-            new[:, 1, axis] = pull
-            np.negative(pull, out=new[:, 0, axis])
+            offset = along.numpy()
+            offset *= self._offset_m
+            new[:, 1, axis] = offset
+            np.negative(offset, out=new[:, 0, axis])
         _substitute(self._rows, self._columns, self._shares, xy, self._n)
         return facing, theta.take(self._last), xy.take(self._last, axis=0)
 
     def _turn(self, theta: np.ndarray, facing: np.ndarray) -> np.ndarray:
-        """Correct the headings of one loop in place; returns the facings as they were in force.
+        """Correct the headings of one loop in place; return the unwrapped facings used.
 
-        Whether an error is wrapped is known only when its link is visited. The whole turns of the
-        loop before are tried; if a link finds an error beyond half a turn, the loop is done again
-        with its turns right. The first such link is right from then on, so this ends.
+        Whether an error must be wrapped is known only when its link is visited. The loop first
+        uses the whole turns of the loop before; if an error exceeds half a turn, it is computed
+        again with the right turns. Each pass settles at least one more link, so this ends.
         """
         new = theta[self._n :].reshape(-1, 2)
         while True:
@@ -230,21 +233,21 @@ class Relaxation:
             error -= facing
             if error.max() < np.pi and error.min() >= -np.pi:
                 return facing
-            right = self._unwrapped_facing(
+            corrected = self._unwrapped_facing(
                 theta.take(self._found_source), theta.take(self._found_target)
             )
-            if np.array_equal(right, facing, equal_nan=True):
+            if np.array_equal(corrected, facing, equal_nan=True):
                 return facing
-            facing = right
+            facing = corrected
 
     def _unwrapped_facing(self, source_rad: np.ndarray, target_rad: np.ndarray) -> np.ndarray:
-        """Facings plus the whole turns that bring their errors into [-pi, pi); 0 if unknown."""
+        """Return facings plus the whole turns that wrap their errors to [-pi, pi); 0 if unknown."""
         error = target_rad - source_rad - self._facing_rad
         turned = self._facing_rad + TWO_PI * np.floor((error + np.pi) / TWO_PI)
         return np.where(self._knows_facing, turned, 0.0)
 
-    def _share(self, correction: float) -> None:
-        """Prepare what depends on the share: the coefficients of a visit, and the pulls."""
+    def _set_correction(self, correction: float) -> None:
+        """Prepare the coefficients of a visit and the offsets, which depend on the correction."""
         stay, go = 1.0 - correction, correction
         self._correction = correction
         self._shares = np.tile([stay, go, go, stay], len(self._source))
@@ -252,4 +255,4 @@ class Relaxation:
         if not self._knows_facing.all():
             self._facing_shares = self._shares.copy()
             self._facing_shares.reshape(-1, 4)[~self._knows_facing] = [1.0, 0.0, 0.0, 1.0]
-        self._pull_m = correction * self._distance_m
+        self._offset_m = correction * self._distance_m

@@ -1,4 +1,4 @@
-"""What a map keeps of its experiences, of the links between them, and of where they come from."""
+"""Tables of a map: its experiences, the links between them, and their origins."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 NUMBER_BITS = 23
-"""An experience's number in its session takes so many; a session's id the 40 above them."""
+"""Bits of an experience's number in its session; the id of the session has the 40 above."""
 
 LINK_COLUMNS = {
     "source": ((), torch.int64),
@@ -23,7 +23,7 @@ EXPERIENCE_COLUMNS = {
     "cell": ((3,), torch.float64),  # pose-cell estimate when it was made: x, y, theta
     "template": ((), torch.int64),
     "first_frame": ((), torch.int64),
-    "session": ((), torch.int64),  # in which it was made, and how many that had made before
+    "session": ((), torch.int64),  # that made it, and its number there
     "number": ((), torch.int64),
 }
 
@@ -31,21 +31,21 @@ ALIAS_COLUMNS = {
     "session": ((), torch.int64),
     "number": ((), torch.int64),
     "first_frame": ((), torch.int64),
-    "experience": ((), torch.int64),  # what it is part of now
-    "turn_rad": ((), torch.float64),  # its heading, minus that of what it is part of
+    "experience": ((), torch.int64),  # that it is part of now
+    "turn_rad": ((), torch.float64),  # its heading minus that of the experience it is part of
 }
 
 
 class Links(NamedTuple):
-    """What the robot measured between experiences; arrays of one length, relative to ``source``.
+    """Displacements measured between experiences, relative to ``source``; arrays of one length.
 
     Attributes:
-        source: Experience that was left.
-        target: Experience that was reached.
-        distance_m: How far the target lies from the source.
-        heading_rad: In which direction, relative to the source's heading.
-        facing_rad: Heading on arrival, relative to the source's heading.
-        duration_s: How long the way took.
+        source: Experience at which the link begins.
+        target: Experience at which it ends.
+        distance_m: Distance from source to target.
+        heading_rad: Direction of the target, relative to the source's heading.
+        facing_rad: Heading of the target, relative to the source's heading.
+        duration_s: Time that the robot took from source to target.
     """
 
     source: np.ndarray
@@ -57,14 +57,14 @@ class Links(NamedTuple):
 
 
 class Origins(NamedTuple):
-    """Where experiences come from; one row for each that any session ever made.
+    """Origins of experiences; one row for each that any session ever made.
 
     Attributes:
         session: Session that made it.
-        number: How many that session had made before.
+        number: Number of experiences that this session had made before.
         first_frame: Frame that made it.
-        experience: What it is now: its id, or that of the experience it was made part of.
-        turn_rad: Heading it was made with, minus the heading of what it is now.
+        experience: Its id now, or that of the experience that it was merged into.
+        turn_rad: Its heading when it was made, minus the heading of ``experience``.
     """
 
     session: np.ndarray
@@ -75,17 +75,18 @@ class Origins(NamedTuple):
 
 
 def origin_key(rows: Mapping[str, np.ndarray]) -> np.ndarray:
-    """One number for each session and number of an experience in it, ``int64``.
+    """Return one ``int64`` key for each pair of session and number.
 
     Example:
         >>> origin_key({"session": np.array([1]), "number": np.array([2])}).tolist()
         [8388610]
     """
-    return (rows["session"] << NUMBER_BITS) | rows["number"]
+    key: np.ndarray = (rows["session"] << NUMBER_BITS) | rows["number"]
+    return key
 
 
 def closes_loop(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Tell which links join places that were both known: not the way on which one was found.
+    """Return which links close a loop: not the first link to an experience from an earlier one.
 
     Example:
         >>> closes_loop(np.array([0, 1, 2]), np.array([1, 2, 0])).tolist()

@@ -1,4 +1,4 @@
-"""Merging: where two maps meet, whether that can be, and how two states become one."""
+"""Merging of maps: matching experiences, checking the match, and merging two states."""
 
 from neuroslam.merging.match import Found, find_match, shared_history
 from neuroslam.merging.merge import Merged, merge

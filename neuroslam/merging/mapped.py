@@ -1,4 +1,4 @@
-"""What matching and merging use of a brain, and whether two brains may be merged at all."""
+"""The interface of a brain for matching and merging, and the check of two configs."""
 
 from typing import Any, Protocol
 
@@ -6,6 +6,7 @@ from torch import Tensor
 
 from neuroslam.config import BrainConfig
 from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.state import answers
 from neuroslam.state.mergeable import Mergeable
 from neuroslam.state.population import Population
 from neuroslam.state.registry import population_classes
@@ -14,7 +15,7 @@ from neuroslam.view.templates import LocalViewCells
 
 
 class Mapped(Protocol):
-    """A brain, as far as its map is concerned."""
+    """The parts of a brain that matching and merging use."""
 
     config: BrainConfig
     map: ExperienceMap
@@ -24,22 +25,26 @@ class Mapped(Protocol):
     @property
     def leader(self) -> Population:
         """The population that decides about experiences."""
+        ...
 
     @property
     def populations(self) -> dict[str, Population]:
         """All populations by kind."""
+        ...
 
     def parts(self) -> dict[str, Mergeable]:
         """The parts of the state by name."""
+        ...
 
     def state_dict(self) -> dict[str, Tensor]:
         """The whole state."""
+        ...
 
 
 def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
-    """Name the parameters of views and populations that differ: such brains cannot merge.
+    """Name the parameters of views and populations that differ, which prevents a merge.
 
-    Where the file of a network's weights lies does not matter, see :func:`differing`.
+    The path of network weights is ignored; :func:`differing` compares the weights themselves.
 
     Example:
         >>> differing_keys(BrainConfig(), BrainConfig(view={"threshold": 0.04}))
@@ -63,21 +68,21 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
 
 
 def differing(one: Mapped, other: Mapped) -> list[str]:
-    """Name what keeps two brains from being merged: parameters, or the network of their views."""
+    """Name the parameters or the network weights that prevent a merge of two brains."""
     keys = differing_keys(one.config, other.config)
     networks = {brain.view.network_digest for brain in (one, other)} - {0}
     if not keys and len(networks) > 1:
-        keys = [f"the weights of {one.config.view.features!r}, by which views were made"]
+        keys = [f"the weights of the network of views, {one.config.view.features!r}, differ"]
     return keys
 
 
 def counts_of(brain: Mapped) -> dict[str, float]:
-    """Count what a brain has learnt: views, experiences, links, and what its populations count."""
+    """Count the templates, experiences and links of a brain, and the counts of its populations."""
     counts: dict[str, Any] = {
         "views": brain.view.n,
         "experiences": brain.map.n,
         "links": brain.map.n_links,
     }
     for population in brain.populations.values():
-        counts |= population.counts()
+        counts |= answers.counts_of(population)
     return counts

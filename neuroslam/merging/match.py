@@ -1,4 +1,4 @@
-"""Where do two finished maps meet? Every view of each is looked for in the other."""
+"""Matching of two finished maps: every template of each is compared with those of the other."""
 
 from typing import NamedTuple
 
@@ -16,12 +16,12 @@ from neuroslam.types import NO_TEMPLATE
 
 
 class Found(NamedTuple):
-    """Where two maps meet, or why that cannot be told.
+    """The match of two maps, or the reason why there is none.
 
     Attributes:
-        match: ``None`` if they do not, as far as can be seen.
-        reason: How it was found, or why not, for a reader.
-        groups: Numbers of pairs that agree with each other, the most first.
+        match: ``None`` if none was found.
+        reason: How the match was found, or why there is none.
+        groups: Sizes of the groups of agreeing experiences, the largest first.
     """
 
     match: Match | None
@@ -30,19 +30,19 @@ class Found(NamedTuple):
 
 
 def find_match(loaded: Mapped, partial: Mapped) -> Found:
-    """Look for the places that two maps share.
+    """Find the experiences that two maps share.
 
-    Places that both have from a session they share are the same. Else each view of either map is
-    looked for in the other, and those are believed of which at least ``sessions.confirm`` agree on
-    how the maps lie: the largest such group, and the others that it leaves room for.
+    Experiences of a session that both maps hold are the same. Otherwise every template of either
+    map is compared with those of the other. A group of at least ``sessions.confirm`` experiences
+    that agree on the alignment is accepted: the largest one, and those consistent with it.
 
     Args:
         loaded: One brain; it is not altered.
-        partial: The other, whose config says how many must agree; it is not altered.
+        partial: The other, whose config sets ``sessions.confirm``; it is not altered.
     """
     apart = differing(loaded, partial)
     if apart:
-        return Found(None, f"views or cells were made with different configs: {'; '.join(apart)}")
+        return Found(None, f"the maps have different configs: {'; '.join(apart)}")
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:
             return Found(None, f"the {name} map is empty")
@@ -57,13 +57,13 @@ def find_match(loaded: Mapped, partial: Mapped) -> Found:
 
 
 def _match_views(loaded: Mapped, partial: Mapped) -> Found:
-    """Look every view of either map up in the other, and keep those that agree."""
+    """Match the templates of either map with the other, and keep the pairs that agree."""
     pairs, best = _alike(loaded, partial)
     threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
     if not len(pairs.partial):
-        nearest = "" if best is None else f"; the most alike that was met differ by {best:.4f}"
+        nearest = "" if best is None else f"; the smallest match error is {best:.4f}"
         return Found(
-            None, f"no view of one looks like a view of the other within {threshold:g}{nearest}"
+            None, f"no view of one map matches one of the other within {threshold:g}{nearest}"
         )
     limits = tolerance((loaded.map, partial.map), partial.config)
     groups = [pairs.pick(g) for g in agreeing(pairs, partial.map.poses, loaded.map.poses, limits)]
@@ -71,8 +71,8 @@ def _match_views(loaded: Mapped, partial: Mapped) -> Found:
     if sizes[0] < confirm:
         return Found(
             None,
-            f"{counted(len(np.unique(pairs.partial)), 'place looks', 'places look')} alike, but at "
-            f"most {sizes[0]} of them agree on how the maps lie, and {confirm} must (--confirm)",
+            f"{counted(len(np.unique(pairs.partial)), 'experience')} matched by view, but at most "
+            f"{sizes[0]} agree on the alignment; expected {confirm} (--confirm)",
             sizes,
         )
     confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
@@ -88,13 +88,11 @@ def _match_views(loaded: Mapped, partial: Mapped) -> Found:
         runner_up=_runner_up(loaded, partial, first, at, limits),
         others=_once(others),
     )
-    return Found(
-        match, f"{counted(len(match.pairs.partial), 'place is', 'places are')} the same", sizes
-    )
+    return Found(match, f"{counted(len(match.pairs.partial), 'experience')} matched by view", sizes)
 
 
 def _alike(loaded: Mapped, partial: Mapped) -> tuple[Pairs, float | None]:
-    """Pairs of places whose views match, looked for both ways, and the smallest difference met."""
+    """Return the pairs of experiences whose views match, and the smallest match error."""
     seen: dict[tuple[int, int], tuple[float, float]] = {}
     best: float | None = None
     threshold = partial.config.view.threshold
@@ -109,12 +107,12 @@ def _alike(loaded: Mapped, partial: Mapped) -> tuple[Pairs, float | None]:
             best = match.error if best is None else min(best, match.error)
             if match.error > threshold:
                 continue
-            memory.last.template = match.template  # the next is likely to be beside it
+            memory.last.template = match.template  # the next match is likely next to it
             key = (view, match.template) if sign > 0 else (match.template, view)
             row = (sign * match.relative_heading_rad, match.error)
             if key not in seen or row[1] < seen[key][1]:
                 seen[key] = row
-    at = [_places_of_views(brain) for brain in (partial, loaded)]
+    at = [_experiences_of_views(brain) for brain in (partial, loaded)]
     rows = [
         (z, u, turn, error)
         for (view_z, view_u), (turn, error) in seen.items()
@@ -124,15 +122,15 @@ def _alike(loaded: Mapped, partial: Mapped) -> tuple[Pairs, float | None]:
     return Pairs.of(sorted(rows)), best
 
 
-def _places_of_views(brain: Mapped) -> dict[int, list[int]]:
-    places: dict[int, list[int]] = {}
+def _experiences_of_views(brain: Mapped) -> dict[int, list[int]]:
+    experiences: dict[int, list[int]] = {}
     for experience, view in enumerate(brain.map.experiences["template"].tolist()):
-        places.setdefault(view, []).append(experience)
-    return places
+        experiences.setdefault(view, []).append(experience)
+    return experiences
 
 
 def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
-    """Find the places that two maps have from one session; ``None`` if they share no session.
+    """Match the experiences of a session that both maps hold; ``None`` if they share no session.
 
     Args:
         loaded: One brain; it is not altered.
@@ -140,7 +138,7 @@ def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
     """
     mine, theirs = loaded.map.origins(), partial.map.origins()
     keys = [origin_key(o._asdict()) for o in (mine, theirs)]
-    _, i, j = np.intersect1d(*keys, return_indices=True)
+    _, i, j = np.intersect1d(keys[0], keys[1], return_indices=True)
     if not len(i):
         return None
     one, other = (Origins(*(c[k] for c in o)) for o, k in ((mine, i), (theirs, j)))
@@ -153,9 +151,8 @@ def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
         k = int(np.argmax(differ))
         return Found(
             None,
-            f"both hold session {session_name(int(one.session[k]))}, but its place "
-            f"{one.number[k]} is not the same in both: one of the maps was made from a copy that "
-            "went another way",
+            f"both maps hold session {session_name(int(one.session[k]))}, but its experience "
+            f"{one.number[k]} differs: two copies of the session were continued differently",
         )
     pairs = _once(
         Pairs(
@@ -169,17 +166,18 @@ def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
     )
     return Found(
         match,
-        f"{counted(len(pairs.partial), 'place is', 'places are')} of sessions that both maps hold",
+        f"{counted(len(pairs.partial), 'experience')} matched by a session that both maps hold",
         (len(i),),
     )
 
 
-def _pixels(brain: Mapped, places: np.ndarray) -> np.ndarray:
-    """Return the views of places, one row each; of what has none, a row that is equal to all."""
-    views = brain.map.experiences["template"].numpy()[places]
+def _pixels(brain: Mapped, experiences: np.ndarray) -> np.ndarray:
+    """Return the templates of experiences, one row each; equal rows for a map without templates."""
+    views = brain.map.experiences["template"].numpy()[experiences]
     if not brain.view.n:
-        return np.zeros((len(places), 1))
-    return brain.view.templates["pixels"].numpy(force=True)[views].reshape(len(places), -1)
+        return np.zeros((len(experiences), 1))
+    pixels: np.ndarray = brain.view.templates["pixels"].numpy(force=True)
+    return pixels[views].reshape(len(experiences), -1)
 
 
 def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:
@@ -187,7 +185,7 @@ def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:
 
 
 def _once(pairs: Pairs) -> Pairs:
-    """Each partial place once, as the most alike has it."""
+    """Keep one pair of each partial experience, that of the smallest match error."""
     order = np.lexsort((pairs.error, pairs.partial))
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(pairs.partial[order]) != 0
@@ -202,7 +200,7 @@ def _fits(
     partial: ExperienceMap,
     limits: Tolerance,
 ) -> bool:
-    """Could odometry be so wrong on the ways between two groups that both are right?"""
+    """Return whether the drift of odometry between two groups can explain that both are right."""
     ends = [first.pick([at]), group.pick([int(np.argmin(group.error))])]
     both = Pairs(*(np.concatenate(columns) for columns in zip(*ends, strict=True)))
     misfit, allowed = far_off(both, loaded, partial, limits)
@@ -212,7 +210,7 @@ def _fits(
 def _runner_up(
     loaded: Mapped, partial: Mapped, pairs: Pairs, at: int, limits: Tolerance
 ) -> float | None:
-    """Smallest difference of the matched view to any view of places elsewhere."""
+    """Return the smallest match error of the matched view with a template elsewhere."""
     templates = loaded.map.experiences["template"].numpy()
     far = elsewhere(loaded.map, int(pairs.loaded[at]), limits)
     rest = np.setdiff1d(templates, templates[~far])

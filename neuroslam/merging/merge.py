@@ -1,4 +1,4 @@
-"""Two sessions become one: the map of one joined to that of another where they meet."""
+"""Merging of two sessions: one map from two, aligned by their match."""
 
 from copy import deepcopy
 from typing import NamedTuple
@@ -17,22 +17,22 @@ from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State
 
 _CHECK_STEPS = 2_000_000
-"""Links times loops of the relaxation that tries a merged map: a fraction of a second."""
+"""Links times loops of the trial relaxation of a merged map: a fraction of a second."""
 
 _STRAINED = 0.1
-"""A link that relaxation leaves off by more than this share of its length is strained."""
+"""A link is strained if its residual after relaxation exceeds this share of its length."""
 
 _TORN = 0.5
-"""Strained links may be off by this share of their length: odometry may be that wrong."""
+"""Allowed residual of strained links, as a share of their length, for errors of odometry."""
 
 
 class Merged(NamedTuple):
-    """What became of two states.
+    """The result of a merge.
 
     Attributes:
-        state: Of the merged brain, without stored maps; ``None`` where the merge is refused.
-        join: How ids and coordinates of the partial session have changed; ``None``: not tried.
-        report: What was done, or why not; what populations count is not in it.
+        state: State of the merged brain, without stored maps; ``None`` if the merge is refused.
+        join: Changes of ids and coordinates of the partial session; ``None``: not computed.
+        report: Report of the merge, without the counts of populations.
     """
 
     state: State | None
@@ -43,16 +43,16 @@ class Merged(NamedTuple):
 def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     """Merge the states of two brains into a new one; neither is altered.
 
-    The merged map is relaxed on a copy first. If that leaves the links off by much more than they
-    were, the experiences were not the same, and the merge is refused.
+    A copy of the merged map is relaxed first. If the residuals of links remain much larger than
+    before, the matched experiences were not the same, and the merge is refused.
 
     Args:
-        loaded: The brain that is merged into: its ids stay.
-        partial: The brain whose session goes on: its activity, time and odometry are kept.
-        match: Where they meet.
+        loaded: The brain that is merged into; its ids stay.
+        partial: The brain whose session continues; its activity, time and odometry are kept.
+        match: Match of the two maps.
 
     Raises:
-        MapError: If the match names experiences that are not there.
+        MapError: If the match names experiences that do not exist.
     """
     report = MergeReport(
         False, "", None,
@@ -61,41 +61,39 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     )  # fmt: skip
     apart = differing(loaded, partial)
     if apart:
-        report.reason = f"views or cells were made with different configs: {'; '.join(apart)}"
+        report.reason = f"the maps have different configs: {'; '.join(apart)}"
         return Merged(None, None, report)
     report.reason = _beyond_odometry(loaded, partial, match)
     if report.reason:
         return Merged(None, None, report)
-    states = [
+    one, other = (
         {n: value.cpu() for n, value in brain.state_dict().items() if not n.startswith("stored.")}
         for brain in (loaded, partial)
-    ]
-    state, join = merge_states(*states, match, partial.config, partial.parts())
+    )
+    state, join = merge_states(one, other, match, partial.config, partial.parts())
     merged = ExperienceMap(partial.map.config, partial.map.torus, partial.map.threshold_cells)
     merged.load_state_dict(part_of(state, "map"))
     if not partial.leader.relaxes_map:
-        merged.measure_links()  # a place cell that became another's lies where that does
+        merged.reset_links()  # a merged place cell has the position of the loaded one
         state |= {f"map.{name}": value for name, value in merged.state_dict().items()}
     _describe(report, loaded, partial, merged, match, join)
     strain, allowed = _strain(report, loaded.map, partial, merged, join)
     if strain > allowed:
         report.reason = (
-            f"the merged map contradicts itself: its strained links would be off by "
-            f"{strain:.3f} m, at most {allowed:.3f} m is allowed"
+            f"the merged map is inconsistent: its strained links have a residual of "
+            f"{strain:.3f} m (RMS) after relaxation; expected at most {allowed:.3f} m"
         )
         return Merged(None, join, report)
     report.merged = True
     new = merged.n - loaded.map.n
     report.reason = (
-        f"{counted(new, 'experience is', 'experiences are')} new"
-        if new
-        else "nothing is new: every experience was known"
+        f"{counted(new, 'experience is', 'experiences are')} new" if new else "no experience is new"
     )
     return Merged(state, join, report)
 
 
 def _beyond_odometry(loaded: Mapped, partial: Mapped, match: Match) -> str:
-    """Say which of the pairs odometry cannot have so far apart."""
+    """Return why the pairs of a match exceed the drift of odometry; empty if they do not."""
     pairs = match.pairs
     inside = (pairs.loaded < loaded.map.n) & (pairs.partial < partial.map.n)
     if len(pairs.partial) == 1 or not inside.all():
@@ -107,8 +105,8 @@ def _beyond_odometry(loaded: Mapped, partial: Mapped, match: Match) -> str:
         return ""
     return (
         f"experiences {pairs.partial[worst]} and {pairs.loaded[worst]} cannot be the same: aligned "
-        f"by the match they are {off_m[worst]:.2f} m apart, odometry may be off by "
-        f"{allowed_m[worst]:.2f} m"
+        f"by the match they are {off_m[worst]:.2f} m apart; expected at most "
+        f"{allowed_m[worst]:.2f} m of odometry drift"
     )
 
 
@@ -136,7 +134,7 @@ def _describe(
         "relative_heading_rad": float(match.turn_rad),
         "places": len(match.pairs.partial),
     }
-    # From minus half to half of the torus is easier to read.
+    # Shifts from minus half to half of the torus are easier to read.
     report.cell_shift = [
         float((shift + n / 2) % n - n / 2)
         for shift, n in zip(join.cell_shift, join.torus, strict=True)
@@ -164,16 +162,16 @@ def _describe(
 def _strain(
     report: MergeReport, loaded: ExperienceMap, partial: Mapped, merged: ExperienceMap, join: Join
 ) -> tuple[float, float]:
-    """Relax a copy of the merged map: how far off are its strained links; how far may they be?"""
+    """Relax a copy of the merged map; return the RMS residual of strained links and its limit."""
     new = links_kept(partial.map.links, loaded.links, join)
     before = np.concatenate([loaded.residuals_m, partial.map.residuals_m[new]])
-    tried = deepcopy(merged)
+    trial = deepcopy(merged)
     loops = min(max(_CHECK_STEPS // max(1, len(before)), 100), 5000)
     if len(join.kept_experiences) < len(join.experiences) - 1:  # one experience strains nothing
-        tried.relax(loops)
-    after, length = tried.residuals_m, tried.links.distance_m
+        trial.relax(loops)
+    after, length = trial.residuals_m, trial.links.distance_m
     report.residual_before_m, report.residual_after_m = _rms(before), _rms(after)
-    moved = tried.poses[:, :2] - merged.poses[:, :2]
+    moved = trial.poses[:, :2] - merged.poses[:, :2]
     report.largest_correction_m = float(np.hypot(*moved.T).max())
     strained = (after > before) & (after > _STRAINED * length)
     factor = partial.config.sessions.residual_factor

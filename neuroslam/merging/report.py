@@ -1,4 +1,4 @@
-"""What a merge did, or why it was refused."""
+"""Reports of merges."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -10,23 +10,24 @@ from neuroslam.errors import counted
 
 @dataclass
 class MergeReport:
-    """What a merge did, or why it was refused.
+    """Result of a merge, or the reason of its refusal.
 
     Attributes:
-        merged: Whether the maps were joined.
-        reason: Why not, or what it brought.
-        at_frame: Frame of the session that goes on, where it was running.
+        merged: Whether the maps were merged.
+        reason: Reason of the refusal, or what the merge added.
+        at_frame: Frame at which a running session joined the map; ``None``: finished sessions.
         loaded_sessions: Sessions of the loaded map.
         partial_sessions: Sessions of the partial map.
-        match: Ids, frames, likeness of the match and of its runner-up, number of equal places.
-        cell_shift: By how many pose cells the partial session moved along x, y, theta.
-        rotation_rad: By how much its map turned.
-        translation_m: By how much its matched place moved, x and y.
-        counts: Views, experiences and links of both maps and of the merged one.
-        residual_before_m: RMS over all links of how far they are off, before.
-        residual_after_m: The same after the merged map was relaxed, to see.
-        largest_correction_m: How far that relaxation moved the place that it moved farthest.
-        found: How it was found that the maps meet, where that was looked for.
+        match: Ids, frames, match error of the match and of its runner-up, number of matched
+            experiences.
+        cell_shift: Shift of the partial session's pose cells along x, y, theta, in cells.
+        rotation_rad: Rotation of its map.
+        translation_m: Displacement of its matched experience, x and y.
+        counts: Templates (``views``), experiences and links of both maps and of the merged one.
+        residual_before_m: RMS residual of all links before the merge.
+        residual_after_m: RMS residual of all links after the trial relaxation.
+        largest_correction_m: Largest displacement of an experience by that relaxation.
+        found: How the match was found; empty for a match that was given.
     """
 
     merged: bool
@@ -38,7 +39,7 @@ class MergeReport:
     cell_shift: list[float] = field(default_factory=list)
     rotation_rad: float | None = None
     translation_m: list[float] = field(default_factory=list)
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    counts: dict[str, dict[str, float]] = field(default_factory=dict)
     residual_before_m: float | None = None
     residual_after_m: float | None = None
     largest_correction_m: float | None = None
@@ -49,21 +50,21 @@ class MergeReport:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Write the report for a reader, a fact a line."""
+        """Return the report as text, one fact per line."""
         lines = [f"{'merged' if self.merged else 'not merged'}: {self.reason}"]
-        if self.match:
-            m = self.match
+        m = self.match or {}
+        if m:
             lines.append(
-                f"match: place {m['partial_experience']} (frame {m['partial_frame']}) is place "
-                f"{m['loaded_experience']} (frame {m['loaded_frame']}), "
-                f"{counted(m['places'], 'place agrees', 'places agree')}"
+                f"match: experience {m['partial_experience']} (frame {m['partial_frame']}) is "
+                f"experience {m['loaded_experience']} (frame {m['loaded_frame']}); "
+                f"{counted(m['places'], 'experience agrees', 'experiences agree')}"
             )
         if self.found:
             lines.append(f"found: {self.found}")
-        by_views = self.match and self.match["error"] is not None
+        by_views = m.get("error") is not None
         if by_views:
             runner_up = "none" if m["runner_up"] is None else f"{m['runner_up']:.4f}"
-            lines.append(f"likeness: view difference {m['error']:.4f}, best elsewhere {runner_up}")
+            lines.append(f"match error: {m['error']:.4f}, smallest elsewhere {runner_up}")
         if self.cell_shift and by_views:
             x, y, theta = self.cell_shift
             lines.append(f"pose cells moved by {x:.2f}, {y:.2f}, {theta:.2f} cells (x, y, theta)")
@@ -71,14 +72,14 @@ class MergeReport:
             x, y = self.translation_m
             lines.append(
                 f"map turned by {np.degrees(self.rotation_rad):.1f} degrees, "
-                f"matched place moved by {x:.2f}, {y:.2f} m"
+                f"matched experience moved by {x:.2f}, {y:.2f} m"
             )
         for what, n in self.counts.items():
             into = f" -> {n['merged']}" if "merged" in n else ""
             lines.append(f"{what.replace('_', ' ')}: {n['loaded']} + {n['partial']}{into}")
         if self.residual_after_m is not None:
             lines.append(
-                f"links off by {self.residual_before_m:.4f} m before, "
+                f"residual of links {self.residual_before_m:.4f} m before, "
                 f"{self.residual_after_m:.4f} m after relaxation (RMS); "
                 f"largest correction {self.largest_correction_m:.3f} m"
             )

@@ -1,4 +1,4 @@
-"""Two states of brains become one: how ids and coordinates change, and every part by its rule."""
+"""Merging of two states: new ids and coordinates, and each part by its rule."""
 
 from collections.abc import Mapping
 
@@ -22,31 +22,31 @@ def make_join(
     config: BrainConfig,
     parts: Mapping[str, Mergeable],
 ) -> Join:
-    r"""Work out how ids and coordinates change.
+    r"""Compute the changes of ids and coordinates.
 
     .. math:: \Delta = P_u - P_z + (0, 0, \rho), \qquad \Delta\theta = \theta_u - \theta_z + \rho
 
-    with :math:`\rho` the turn of the match. Each further pair of equal experiences becomes one
-    too; their views become one view.
+    with :math:`\rho` the relative heading of the match. Each further matched pair becomes one
+    experience too, and their templates one template.
 
     Args:
         loaded: State of the brain that is merged into.
-        partial: State of the brain whose session goes on.
-        match: Where they meet.
-        config: Of both.
-        parts: Of such a brain by name; its populations say how cells and their frames move.
+        partial: State of the brain whose session continues.
+        match: Match of the two maps.
+        config: Config of both brains.
+        parts: Parts of such a brain by name; its populations compute how cells and frames move.
 
     Raises:
-        MapError: If the match names places that are not there.
+        MapError: If the match names experiences that do not exist.
     """
     pairs = match.pairs
-    places = {name: state["map.experiences.pose"] for name, state in _named(loaded, partial)}
+    poses = {name: state["map.experiences.pose"] for name, state in _named(loaded, partial)}
     for name, ids in (("loaded", pairs.loaded), ("partial", pairs.partial)):
-        wrong = (ids < 0) | (ids >= len(places[name]))
+        wrong = (ids < 0) | (ids >= len(poses[name]))
         if wrong.any():
             raise MapError(
-                f"merge: the match names place {ids[wrong][0]} of the {name} map; "
-                f"it has {len(places[name])}"
+                f"merge: the match names experience {ids[wrong][0]} of the {name} map; "
+                f"expected 0 to {len(poses[name]) - 1}"
             )
     views = {name: state["map.experiences.template"].numpy() for name, state in
              _named(loaded, partial)}  # fmt: skip
@@ -55,19 +55,19 @@ def make_join(
         views["partial"][pairs.partial], views["loaded"][pairs.loaded], pairs,
         len(partial["view.templates.pixels"]),
     )  # fmt: skip
-    n_loaded, n_partial = len(places["loaded"]), len(places["partial"])
+    n_loaded, n_partial = len(poses["loaded"]), len(poses["partial"])
     experiences = _numbered(n_partial, n_loaded, pairs.partial, pairs.loaded)
     cells = config.pose_cells
     torus = (cells.n_xy, cells.n_xy, cells.n_theta)
-    pivot = Pose(*places["partial"][match.partial].tolist())
-    x, y, theta = places["loaded"][match.loaded].tolist()
+    pivot = Pose(*poses["partial"][match.partial].tolist())
+    x, y, theta = poses["loaded"][match.loaded].tolist()
     populations = {name: p for name, p in parts.items() if isinstance(p, Population)}
     moved = [p.moved_cells(loaded, partial, match, config) for p in populations.values()]
     cell_moves = next((found for found in moved if found is not None), None) or MovedCells(
         np.zeros(3), np.zeros((len(view_ids), 3)), partial["map.experiences.cell"].numpy()
     )
     turns = np.zeros(len(views["partial"]))
-    has_view = views["partial"] != NO_TEMPLATE  # a place without a camera has none
+    has_view = views["partial"] != NO_TEMPLATE  # experiences of a brain without views have none
     turns[has_view] = view_turns[views["partial"][has_view]]
     turns[pairs.partial] = pairs.turn_rad
     join = Join(
@@ -103,7 +103,7 @@ def _named(loaded: State, partial: State) -> tuple[tuple[str, State], tuple[str,
 
 
 def _numbered(n: int, first: int, folded: np.ndarray, onto: np.ndarray) -> np.ndarray:
-    """Ids of ``n`` things that follow ``first`` others, but for those that become one of them."""
+    """Return the ids of ``n`` rows: that of its match, or else the next number from ``first``."""
     ids = np.full(n, -1, dtype=np.int64)
     ids[folded] = onto
     kept = ids < 0
@@ -114,11 +114,11 @@ def _numbered(n: int, first: int, folded: np.ndarray, onto: np.ndarray) -> np.nd
 def _fold_views(
     partial: np.ndarray, loaded: np.ndarray, pairs: Pairs, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Loaded view that each partial one becomes, by its most similar pair; -1 where it stays."""
+    """Return the turn and the loaded template of each partial one, by its best pair; -1: none."""
     ids, turns = np.full(n, -1, dtype=np.int64), np.zeros(n)
     has_view = (partial != NO_TEMPLATE) & (loaded != NO_TEMPLATE)
     partial, loaded, pairs = partial[has_view], loaded[has_view], pairs.pick(has_view)
-    best = np.lexsort((pairs.error, np.arange(len(partial)) != 0))[::-1]  # the match wins
+    best = np.lexsort((pairs.error, np.arange(len(partial)) != 0))[::-1]  # the match has priority
     ids[partial[best]], turns[partial[best]] = loaded[best], pairs.turn_rad[best]
     return turns, ids
 
@@ -132,35 +132,35 @@ def merge_states(
 ) -> tuple[State, Join]:
     """Merge two state dicts of brains into one; a pure function, neither is altered.
 
-    The session that goes on is the partial one. Each part merges by its own rule,
+    The partial session continues. Each part merges by its own rule,
     :meth:`~neuroslam.state.mergeable.Mergeable.merged`; stored maps are left out.
 
     Args:
         loaded: ``state_dict`` of the brain that is merged into.
-        partial: ``state_dict`` of the brain whose session goes on.
-        match: Where they meet.
-        config: Of both.
-        parts: Of such a brain by name, for their rules.
+        partial: ``state_dict`` of the brain whose session continues.
+        match: Match of the two maps.
+        config: Config of both brains.
+        parts: Parts of such a brain by name.
 
     Returns:
-        The ``state_dict`` of the merged brain, and how the partial one's ids and poses changed.
+        The ``state_dict`` of the merged brain, and the changes of ids and poses of the partial one.
 
     Raises:
-        MapError: If the match names places that are not there, or a part of the state has no rule.
+        MapError: If the match names experiences that do not exist, or a tensor has no merge rule.
     """
     join = make_join(loaded, partial, match, config, parts)
     merged: State = {}
     for name, part in parts.items():
-        states = [part_of(state, name) for state in (loaded, partial)]
+        one, other = part_of(loaded, name), part_of(partial, name)
         with torch.no_grad():
-            result = part.merged(*states, join)
-        if set(result) != set(states[1]):
-            missing = sorted(set(result) ^ set(states[1]))
-            raise MapError(f"merge: {name} has no rule for {', '.join(missing)}")
+            result = part.merged(one, other, join)
+        if set(result) != set(other):
+            missing = sorted(set(result) ^ set(other))
+            raise MapError(f"merge: {name} has no rule for {', '.join(missing)}; extend merged()")
         merged |= {f"{name}.{key}": value for key, value in result.items()}
-    forgotten = sorted(
-        key for key in partial if key not in merged and not key.startswith("stored.")
-    )
-    if forgotten:
-        raise MapError(f"merge: nothing says how {forgotten[0]} merges; add a Mergeable")
+    unmerged = sorted(key for key in partial if key not in merged and not key.startswith("stored."))
+    if unmerged:
+        raise MapError(
+            f"merge: no rule for {', '.join(unmerged)}; make it part of a Mergeable of the brain"
+        )
     return merged, join

@@ -1,4 +1,4 @@
-"""Self-motion from what the robot sees."""
+"""Visual odometry: self-motion from camera images."""
 
 from neuroslam.odometry.visual import VisualOdometry
 

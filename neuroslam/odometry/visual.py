@@ -1,11 +1,11 @@
-"""Visual odometry: how fast the robot drives and turns, from two pictures in a row.
+"""Visual odometry: speed and turn rate of the robot from two consecutive images.
 
-Turning to the left moves the picture to the right: see ``docs/sign_conventions.md``.
+A turn to the left shifts the image to the right: see ``docs/sign_conventions.md``.
 """
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,18 +14,18 @@ from torch import Tensor
 
 from neuroslam.config.sections import OdometryConfig, Region
 from neuroslam.errors import BadFrame, ConfigError
-from neuroslam.sensors.frames import check_picture
+from neuroslam.sensors.frames import check_image
 from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
 from neuroslam.types import Velocity
 
 
 def profile(image: np.ndarray, region: Region) -> np.ndarray:
-    """Return the mean of each column of a region, grey in [0, 1].
+    """Return the mean of each column of an image region, grey in [0, 1].
 
     Args:
         image: ``uint8``, ``(h, w)``.
-        region: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded.
+        region: ``x_min, x_max, y_min, y_max`` in px; the maxima are excluded.
 
     Returns:
         ``float64``, ``(x_max - x_min,)``.
@@ -38,7 +38,7 @@ def profile(image: np.ndarray, region: Region) -> np.ndarray:
 
 
 def column_sums(image: np.ndarray, region: Region) -> np.ndarray:
-    """Return the sum of each column of a region: :func:`profile` before the division, exact.
+    """Return the sum of each column of an image region: :func:`profile` before the division.
 
     Returns:
         ``int32``, ``(x_max - x_min,)``.
@@ -49,7 +49,7 @@ def column_sums(image: np.ndarray, region: Region) -> np.ndarray:
 
 
 def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tuple[int, float]:
-    r"""Find the offset at which the previous profile looks most like the present one.
+    r"""Find the shift that best aligns the previous profile with the present one.
 
     .. math:: d(s) = \frac{1}{n - |s|} \sum_i |p_t(i) - p_{t-1}(i - s)|, \quad |s| < S
 
@@ -59,9 +59,9 @@ def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tup
         max_shift: :math:`S`, at most ``n``.
 
     Returns:
-        The offset :math:`s` of the smallest :math:`d`, positive where the picture moved to the
-        right, and that :math:`d`. Of equal ones the first in the order 0, -1, ..., -(S-1), 1, ...,
-        S-1 is taken. Sums of integers are exact, so equal ones are found to be equal.
+        The shift :math:`s` of the smallest :math:`d`, positive if the image moved to the right, and
+        that :math:`d`. Ties are resolved in the order 0, -1, ..., -(S-1), 1, ..., S-1; the sums are
+        of integers, so ties are exact.
 
     Example:
         >>> match_profiles(np.array([9.0, 1, 2, 7, 3]), np.array([1.0, 2, 7, 3, 5]), 3)
@@ -83,7 +83,7 @@ def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tup
 
 @lru_cache(maxsize=16)
 def _offsets(n: int, max_shift: int) -> tuple[np.ndarray, ...]:
-    """Which columns overlap, how many, at which shift, row by row; and the order of trial."""
+    """Return overlapping columns, their number and the shift, row by row; and the order of ties."""
     shifts = np.arange(max_shift - 1, -max_shift, -1)
     source = np.arange(n)[None, :] - shifts[:, None]
     overlap = ((source >= 0) & (source < n)).astype(np.float64)
@@ -95,16 +95,16 @@ def _offsets(n: int, max_shift: int) -> tuple[np.ndarray, ...]:
 def motion_from_match(
     shift_px: int, difference: float, image_width: int, dt_s: float, config: OdometryConfig
 ) -> Velocity:
-    r"""Turn an offset and a difference into motion.
+    r"""Convert a shift and a difference of profiles to motion.
 
     .. math:: \omega = s \cdot \mathrm{fov} / (\mathrm{width} \cdot \Delta t), \quad
               v = \min(c \cdot d, v_{\max}), \text{ 0 below } v_{\min}
 
     Args:
-        shift_px: Offset :math:`s` of the turn region, to the right positive.
-        difference: Smallest difference :math:`d` in the speed region, grey in [0, 1].
-        image_width: Of the whole picture, in px.
-        dt_s: Time between the pictures in seconds.
+        shift_px: Shift :math:`s` of the turn region, positive to the right.
+        difference: Smallest difference :math:`d` of the speed region, grey in [0, 1].
+        image_width: Width of the whole image in px.
+        dt_s: Time between the images in seconds.
         config: Field of view, scale :math:`c` and bounds of the speed.
 
     Example:
@@ -113,12 +113,19 @@ def motion_from_match(
     """
     w_deg_s = shift_px * config.fov_deg / image_width * (1.0 / dt_s)
     v = min(difference * config.speed_scaling_m_s, config.max_speed_m_s)
-    # Degrees first: this order of rounding is the reference's, to the last bit.
+    # Degrees first, which rounds as the reference implementation does, to the last bit.
     return Velocity(v if v >= config.min_speed_m_s else 0.0, w_deg_s * math.pi / 180.0)
 
 
+class _Size(Scalars):
+    """Size of the images in px; zero before the first image."""
+
+    height: int
+    width: int
+
+
 class Profiles(NamedTuple):
-    """Size of a picture in px, and the column sums of its speed and turn region."""
+    """Size of an image in px, and the column sums of its speed and turn regions."""
 
     height: int
     width: int
@@ -127,16 +134,16 @@ class Profiles(NamedTuple):
 
 
 class VisualOdometry(AboutNow):
-    """Measures motion by matching each picture with the one before it.
+    """Measures self-motion by matching the profiles of consecutive images.
 
-    The column sums of the last picture's two regions are buffers, so ``state_dict`` is complete.
+    The column sums of the last image's two regions are buffers, so ``state_dict`` is complete.
 
     Example:
         >>> odometry = VisualOdometry(OdometryConfig(max_shift_px=4))
-        >>> picture = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
-        >>> odometry(picture, dt_s=0.1)  # the first: nothing to compare it with
+        >>> image = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
+        >>> odometry(image, dt_s=0.1)  # the first image
         Velocity(v_m_s=0.0, w_rad_s=0.0)
-        >>> odometry(np.roll(picture, 2, axis=1), dt_s=0.1).w_rad_s > 0  # right: it turned left
+        >>> odometry(np.roll(image, 2, axis=1), dt_s=0.1).w_rad_s > 0  # a left turn
         True
     """
 
@@ -146,44 +153,52 @@ class VisualOdometry(AboutNow):
     def __init__(self, config: OdometryConfig) -> None:
         super().__init__()
         self.config = config
-        self.size = Scalars(height=0, width=0)  # zero before the first picture
-        self._regions: tuple[Region, Region] | None = None  # follow from the config and the size
+        self.size = _Size(height=0, width=0)
+        # Regions are derived from the config and the size of an image.
+        self._regions: tuple[tuple[int, int], tuple[Region, Region]] | None = None
         self.register_buffer("speed_sums", torch.zeros(0, dtype=torch.int32))
         self.register_buffer("turn_sums", torch.zeros(0, dtype=torch.int32))
         self.register_load_state_dict_pre_hook(_resize_to_saved)
 
+    if TYPE_CHECKING:
+
+        def __call__(self, image: np.ndarray, dt_s: float) -> Velocity:
+            """Call :meth:`forward`."""
+            ...
+
     def forward(self, image: np.ndarray, dt_s: float) -> Velocity:
-        """Compare a picture with the one before it and remember it.
+        """Measure the motion since the image before this one, and remember this one.
 
         Args:
             image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-            dt_s: Time since the previous picture in seconds.
+            dt_s: Time since the previous image in seconds.
 
         Raises:
-            ConfigError: If a region does not lie in the picture, or is too narrow for the offsets.
-            BadFrame: If the picture is not of the size and kind of those before, or no time passed.
+            ConfigError: If a region does not lie in the image, or is too narrow for the shifts.
+            BadFrame: If the image has another type or size than those before it, or ``dt_s`` is
+                not positive.
         """
         velocity, profiles = self.measure(image, dt_s)
         self.remember(profiles)
         return velocity
 
     def measure(self, image: np.ndarray, dt_s: float) -> tuple[Velocity, Profiles]:
-        """Compare a picture with the one before it; nothing changes. See :meth:`forward`."""
+        """Measure the motion as :meth:`forward` does, without changing the state."""
         if not dt_s > 0.0:
-            raise BadFrame(f"VisualOdometry: {dt_s} s since the last picture; expected more than 0")
-        check_picture(image, "VisualOdometry")
+            raise BadFrame(f"VisualOdometry: {dt_s} s since the last image; expected more than 0")
+        check_image(image, "VisualOdometry")
         if image.ndim == 3:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         height, width = image.shape
         first = self.size.height == 0
         if not first and (height, width) != (self.size.height, self.size.width):
             raise BadFrame(
-                f"VisualOdometry: picture is {width} x {height} px; expected "
-                f"{self.size.width} x {self.size.height} px as before it"
+                f"VisualOdometry: image is {width} x {height} px; expected "
+                f"{self.size.width} x {self.size.height} px as in the frames before it"
             )
-        if self._regions is None:
-            self._regions = regions_in(height, width, self.config)
-        speed_region, turn_region = self._regions
+        if self._regions is None or self._regions[0] != (height, width):
+            self._regions = (height, width), regions_in(height, width, self.config)
+        speed_region, turn_region = self._regions[1]
         now = Profiles(
             height, width, column_sums(image, speed_region), column_sums(image, turn_region)
         )
@@ -198,20 +213,20 @@ class VisualOdometry(AboutNow):
         return motion_from_match(shift, difference, width, dt_s, self.config), now
 
     def remember(self, profiles: Profiles) -> None:
-        """Keep the profiles of a picture for the comparison with the next."""
+        """Keep the profiles of an image for the comparison with the next."""
         if self.size.height == 0:
             self.size.height, self.size.width = profiles.height, profiles.width
-        # By way of _buffers: setting an attribute of a module costs more than matching a profile.
+        # Into _buffers: setting an attribute of a module takes longer than matching a profile.
         device = self.speed_sums.device
         self._buffers["speed_sums"] = torch.from_numpy(profiles.speed).to(device)
         self._buffers["turn_sums"] = torch.from_numpy(profiles.turn).to(device)
 
 
 def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region, Region]:
-    """Return the speed and the turn region of a picture: the config's, or its lower, upper half.
+    """Return the speed and turn regions of an image: the config's, or its lower and upper half.
 
     Raises:
-        ConfigError: If a region does not lie in the picture, or is narrower than ``max_shift_px``.
+        ConfigError: If a region does not lie in the image, or is narrower than ``max_shift_px``.
 
     Example:
         >>> regions_in(120, 160, OdometryConfig())
@@ -226,13 +241,13 @@ def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region,
         x_min, x_max, y_min, y_max = region
         if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
             raise ConfigError(
-                f"odometry.{name} = {list(region)} does not lie in a picture of {width} x {height} "
+                f"odometry.{name} = {list(region)} does not lie in an image of {width} x {height} "
                 "px; expected x_min, x_max, y_min, y_max inside it"
             )
         if x_max - x_min < config.max_shift_px:
             raise ConfigError(
                 f"odometry.max_shift_px = {config.max_shift_px} is more than the {x_max - x_min} "
-                f"columns of {name}; set it to half of them or less"
+                f"columns of {name}; set it to half of them or fewer"
             )
         halves[name] = region
     return halves["speed_region"], halves["turn_region"]
@@ -243,5 +258,5 @@ def _resize_to_saved(
 ) -> None:
     for name in ("speed_sums", "turn_sums"):
         saved = state.get(prefix + name)
-        if saved is not None and saved.ndim == 1:  # another shape is left for torch to refuse
+        if saved is not None and saved.ndim == 1:  # torch rejects another shape
             setattr(module, name, getattr(module, name).new_empty(saved.shape))

@@ -1,6 +1,9 @@
 """Content of a report page: facts as plain values, tables as arrays."""
 
+import base64
+import inspect
 import math
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,8 +21,11 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
-from neuroslam.runs.reading import odometry_track, places_of, trajectory, true_poses
+from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
+from neuroslam.state.answers import counts_of, pictures_of
+from neuroslam.state.registry import population_classes
 
+_DRAWN = ("pose", "place", "semantic")  # kinds that the page draws by scripts of its own
 ACTIONS = ("none", "create", "link", "set")
 MOST_ROWS = 100_000
 """Frames on a page, about: of longer runs every k-th, and those that changed the map."""
@@ -88,6 +94,7 @@ def collect(run: FinishedRun) -> Facts:
                   "on_bad_frame": run.plan.on_bad_frame},
         "truth_scale": truth_on_map(trajectory(run.brain, run.trace), true_poses(run.trace))[1],
         "lost": [_within(rows, span) for span in lost_spans(run)],
+        "populations": populations(run.brain),
         "notes": notes,
     }  # fmt: skip
     lost_s = run.metrics.get("lost_s", 0.0)
@@ -120,7 +127,7 @@ def _stride(n: int) -> int:
 def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Return the columns of all frames; experiences and poses are those of the final map."""
     frames, trace, brain = run.frames, run.trace, run.brain
-    place = places_of(brain, trace)[0]
+    place = experiences_of(brain, trace)[0]
     track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
     truth = truth_on_map(track, true_poses(trace))[0]
     whole = {
@@ -239,6 +246,53 @@ _ARRAYS: dict[str, Callable[[Any], dict[str, np.ndarray]]] = {
 """Kind of a population -> the arrays that the page draws of it."""
 
 
+def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
+    """Tell what each population has learnt, and what it looks like at the end of the run.
+
+    Pictures of populations that the page draws itself are left out; one that has no other and
+    counts nothing is left out altogether.
+    """
+    cards = []
+    for kind, population in brain.populations.items():
+        drawn = {} if kind in _DRAWN else pictures_of(population)
+        card = {
+            "kind": kind.replace("_", " "),
+            "what": _plain((inspect.getdoc(type(population)) or "").partition("\n")[0]),
+            "counts": metric_rows(counts_of(population)),
+            "pictures": [
+                {"tag": tag, "layers": [_png(layer) for layer in layers]}
+                for tag, picture in drawn.items()
+                for layers in (picture if isinstance(picture, tuple) else (picture,),)
+            ],
+        }
+        if card["counts"] or card["pictures"]:
+            cards.append(card)
+    return cards
+
+
+def _plain(text: str) -> str:
+    """Drop the roles and quotes of a docstring.
+
+    Example:
+        >>> _plain("See :func:`~a.b`, or ``c``.")
+        'See b, or c.'
+    """
+    return re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text).replace("`", "")
+
+
+def _png(picture: np.ndarray) -> dict[str, Any]:
+    """Write activity as a picture, a pixel for each cell; rows point up."""
+    if picture.ndim == 2:
+        shown = np.nan_to_num(np.asarray(picture, dtype=np.float64), posinf=0.0, neginf=0.0)
+        grey = (255.0 * shown / max(float(shown.max()), 1e-300)).round().clip(0, 255)
+        pixels = cv2.applyColorMap(grey[::-1].astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    else:
+        pixels = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    height, width = pixels.shape[:2]
+    data = base64.b64encode(cv2.imencode(".png", pixels)[1].tobytes()).decode()
+    return {"png": data, "width": width, "height": height}
+
+
 def lost_spans(run: FinishedRun) -> list[tuple[int, int]]:
     """Find when the robot was lost, from ``cells/doubt_s`` in ``events/``.
 
@@ -355,6 +409,7 @@ def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
     plain = BrainConfig()
     general: dict[str, Any] = {"section": "brain", "used": True, "rows": []}
     sections = [general]
+    views = any(cls.needs_views for cls in population_classes(config))
     own = {kind: section for kind, section in (config.model_extra or {}).items()}
     for name, section in own.items():
         rows = _parameters(section, type(section)(), "")
@@ -365,6 +420,7 @@ def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
             general["rows"].append(_parameter(name, value, default, field.description))
             continue
         used = name not in _USED_BY or _USED_BY[name] in config.cells
+        used = used or (name == "view" and views)
         sections.append({"section": name, "used": used, "rows": _parameters(value, default, "")})
     return sections
 

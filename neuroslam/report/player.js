@@ -186,6 +186,7 @@ async function start() {
   startLayers();
   startCharts();
   startCells();
+  startPopulations();
   startSessions();
   startMetrics();
   startConfig();

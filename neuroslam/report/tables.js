@@ -18,7 +18,12 @@ function tableOf(names, rows) {
     make("thead", {}, make("tr", {}, ...names.map((text) => make("th", { text })))), make("tbody", {}, ...rows)));
 }
 
-const BEGAN = { start: "the run", carried: "the robot was kidnapped", gap: "a gap in the frames" };
+const BEGAN = {
+  start: "the run",
+  kidnapped: "the robot was kidnapped",
+  carried: "the robot was kidnapped", // brains of format 3
+  gap: "a gap in the frames",
+};
 
 function startSessions() {
   const list = $("session-list"), places = new Array(about.sessions.length).fill(0);
@@ -62,6 +67,24 @@ function reportCard(outcome, report, point) {
     card.append(make("button", { type: "button", text: "Go to the frame", onclick: () => { chooseRow(rowOfFrame(report.frame)); $("explorer").scrollIntoView(); } }));
   }
   return card;
+}
+
+// Populations tell their counts and pictures themselves: the page need not know them.
+function startPopulations() {
+  $("populations").hidden = $("to-populations").hidden = !about.populations.length;
+  for (const one of about.populations) {
+    const card = make("div", { class: "card" }, make("h3", { text: one.kind }), make("p", { text: one.what }));
+    if (one.counts.length) card.append(facts(one.counts.map(([name, value, unit]) => [name, `${figure(value)} ${unit}`.trim()])));
+    for (const { tag, layers } of one.pictures) {
+      const drawn = layers.map(({ png, width, height }) => {
+        const scale = Math.max(1, Math.min(12, Math.floor(280 / Math.max(width, height))));
+        return make("img", { class: "activity", src: `data:image/png;base64,${png}`,
+          style: { width: `${width * scale}px`, height: `${height * Math.max(scale, Math.ceil(24 / height))}px` }, alt: `${tag}: activity of ${one.kind}` });
+      });
+      card.append(make("figure", {}, make("div", { class: "layers-of" }, ...drawn), make("figcaption", { text: tag })));
+    }
+    $("population-list").append(card);
+  }
 }
 
 function figure(value) {

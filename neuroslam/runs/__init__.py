@@ -1,1 +1,1 @@
-"""What the command line does with whole runs: make, resume, look into, merge, compare them."""
+"""Whole runs, as the command line makes them: run, resume, inspect, verify, merge, compare."""

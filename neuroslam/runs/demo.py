@@ -1,7 +1,8 @@
-"""The demonstration: a drive through an embedded world, in two sessions that become one map."""
+"""The demo: a drive through a rendered world, in two sessions that are merged into one map."""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -16,11 +17,11 @@ from neuroslam.runs.reading import odometry_track, read_frames, read_plan, read_
 from neuroslam.runs.results import RunSummary
 from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
-from neuroslam.types import StepResult
+from neuroslam.types import PoseEstimate, StepResult
 
 WORLD = "world:corridor?laps=2&noise=0.05&light=0.3&people=4"
 FIRST_STOP, SECOND_START = 240, 290
-"""Frames: of a lap of 340 the first session sees the first part, the second begins beyond it."""
+"""Frames, of a lap of 340: the first session ends before the start of the second."""
 
 
 def demo(
@@ -28,7 +29,7 @@ def demo(
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
 ) -> list[tuple[str, str]]:
-    """Map a corridor in two sessions, the second from a place unknown to it, and draw the map.
+    """Map a corridor in two sessions, the second from an unknown start, and draw the map.
 
     Args:
         out: Folder for the runs ``first`` and ``second``, ``summary.png`` and ``sessions.png``; an
@@ -37,16 +38,16 @@ def demo(
         on_start: Called before each session, with the frame at which it ends.
 
     Returns:
-        What was measured, as names and figures to print.
+        Name and figure of each measured quantity, to print.
 
     Raises:
         RunError: If the folder holds another run, or cannot be written.
-        KeyboardInterrupt: If a session was; its run is saved.
+        KeyboardInterrupt: If a session is interrupted; its run is saved.
     """
     out = Path(out)
     for folder in (out, out / "first", out / "second"):
         if (folder / "frames.csv").exists() and read_plan(folder).source != WORLD:
-            raise RunError(f"{folder}: holds a run of something else; take another folder")
+            raise RunError(f"{folder}: holds a run of another source; choose another folder")
     require_free(out, WORLD, overwrite=True)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -63,7 +64,7 @@ def demo(
                 overwrite=True, on_step=on_step, on_start=on_start,
             )
         )  # fmt: skip
-        if parts[-1].interrupted:  # half a session would be told as if it were whole
+        if parts[-1].interrupted:  # figures of half a session would mislead
             raise KeyboardInterrupt
     draw_summary(out / "second", out / "summary.png")
     _draw_sessions(out, parts[1])
@@ -71,31 +72,31 @@ def demo(
     rows = [
         ("frames, first session and second", f"{first['frames']}, {second['frames']}"),
         ("frames/s", f"{second['frames_per_s']:.0f}"),
-        ("places of the first session", f"{first['experiences']}"),
+        ("experiences of the first session", f"{first['experiences']}"),
     ]
     for report in parts[1].merges:
-        places = report["counts"]["experiences"]
-        rows.append((f"recognised at frame {report['at_frame']}, places before",
-                     f"{places['loaded']} + {places['partial']}"))  # fmt: skip
-        rows.append(("places after the merge", f"{places['merged']}"))
+        n = report["counts"]["experiences"]
+        rows.append((f"merged at frame {report['at_frame']}, experiences before",
+                     f"{n['loaded']} + {n['partial']}"))  # fmt: skip
+        rows.append(("experiences after the merge", f"{n['merged']}"))
     return [
         *rows,
-        ("places in the end", f"{second['experiences']}"),
+        ("experiences at the end", f"{second['experiences']}"),
         ("loop closures", f"{second['loop_closures']}"),
-        ("error of odometry alone (ATE)", f"{second['odometry_ate_rmse_m']:.2f} m"),
-        ("error of the map (ATE)", f"{second['ate_rmse_m']:.2f} m"),
+        ("ATE of odometry alone (rigid)", f"{second['odometry_ate_rmse_m']:.2f} m"),
+        ("ATE of the map (rigid)", f"{second['ate_rmse_m']:.2f} m"),
     ]
 
 
 def _draw_sessions(out: Path, summary: RunSummary) -> None:
-    """Draw the map of the first session beside that of both."""
+    """Draw the map of the first session beside the merged map."""
     brains = [load_brain(out / name / "brain.safetensors") for name in ("first", "second")]
     sessions = [brain.sessions.now.id for brain in brains]
     matched = [report["match"]["loaded_experience"] for report in summary.merges]
     panels = []
     for title, brain, points in (
         ("after the first session", brains[0], []),
-        ("after the second, joined", brains[1], matched),
+        ("after the second session, merged", brains[1], matched),
     ):
         links, table = brain.map.links, brain.map.experiences
         panels.append(
@@ -103,7 +104,7 @@ def _draw_sessions(out: Path, summary: RunSummary) -> None:
                 title,
                 brain.map.poses,
                 np.column_stack([links.source, links.target]),
-                np.array([sessions.index(one) for one in table["session"].tolist()]),
+                np.array([sessions.index(session) for session in table["session"].tolist()]),
                 brain.map.poses[points, :2],
             )
         )
@@ -126,7 +127,7 @@ def draw_summary(out: str | Path, path: Path) -> None:
         np.column_stack([links.source, links.target]),
         frames,
         activity=cells.activity.numpy(),
-        estimate=cells.estimate,
+        estimate=cast(PoseEstimate, cells.estimate),
         image=last.image,
         template=brain.view.template_image(seen) if seen >= 0 else None,
         threshold=brain.config.view.threshold,

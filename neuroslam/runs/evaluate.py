@@ -1,4 +1,4 @@
-"""A run's errors against the truth."""
+"""Errors of a run's trajectory against the ground truth."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,13 +22,13 @@ def evaluate(
     align: AlignmentMode = "rigid",
     on_note: Callable[[str], None] | None = None,
 ) -> list[tuple[str, ErrorStatistics, str]]:
-    """Compare a run, or any TUM file, with the true track.
+    """Compare the trajectory of a run, or of a TUM file, with the ground truth.
 
     Args:
         track: Folder of a run, or a TUM file.
-        truth: TUM file; a run of a source that knows its truth needs none.
-        align: How the track is laid over the truth before it is compared.
-        on_note: Called with what the errors leave out, if they do: frames without a true pose.
+        truth: TUM file; not needed for a run whose source knows the truth.
+        align: How the track is aligned with the truth before the comparison.
+        on_note: Called with a note if frames without a true pose are left out.
 
     Returns:
         Name of the error, its statistics, its unit.
@@ -48,18 +48,23 @@ def evaluate(
     else:
         trace = None if out is None else read_trace(out, len(found.times_s))
         true_track = None if trace is None else true_poses(trace)
-        if true_track is None:
-            raise RunError(f"{track}: its source knows no truth; give one with --truth FILE")
+        if trace is None or true_track is None:
+            raise RunError(
+                f"{track}: its source has no ground truth; give a TUM file with --truth FILE"
+            )
         i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
         estimate, reference = found.poses[i], true_track[j]
     if len(estimate) < 2:
+        check = "" if truth is None else f"; is {truth} the truth of this track?"
         raise RunError(
-            f"{track}: {len(estimate)} of its frames have a true pose of their time; expected two"
+            f"{track}: a true pose within 0.02 s for {len(estimate)} of "
+            f"{counted(len(found.times_s), 'frame')}; expected at least 2 frames{check}"
         )
     n_frames = len(found.times_s)
     if on_note is not None and len(estimate) < n_frames:
         on_note(
-            f"{len(estimate)} of {counted(n_frames, 'frame')} have truth; the errors are theirs"
+            f"{len(estimate)} of {counted(n_frames, 'frame')} have a true pose; "
+            "the errors are over those"
         )
     relative = relative_pose_error(estimate, reference)
     return [
@@ -68,6 +73,6 @@ def evaluate(
             absolute_trajectory_error(estimate[:, :2], reference[:, :2], align),
             "m",
         ),
-        ("relative, a frame", relative.translation_m, "m"),
-        ("relative, a frame", relative.rotation_rad, "rad"),
+        ("relative, per frame", relative.translation_m, "m"),
+        ("relative, per frame", relative.rotation_rad, "rad"),
     ]

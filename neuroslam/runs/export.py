@@ -1,9 +1,10 @@
-"""A map for other programs: tracks, pose-graph solvers, graph tools, neuromorphic simulators."""
+"""Export of a map: trajectories, pose graphs, graph files and neuromorphic networks."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,30 +14,31 @@ from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file
 from neuroslam.runs.reading import track_file
 from neuroslam.spiking.export import export_nir
+from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.state.files import write_atomically
 from neuroslam.state.sessions import session_name
 
 
 def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
-    r"""Write a map in another program's format.
+    r"""Write a map in the format of another program.
 
-    - ``tum``: of a run's folder its ``trajectory.tum``, a pose a frame; of a brain file the poses
-      of its experiences in order of their ids. Their time is no time but the number of the frame
-      that made them; where the frames of another session begin again from a lower number, they
-      are counted on, for times must rise.
+    - ``tum``: for a run folder its ``trajectory.tum``, one pose per frame; for a brain file the
+      poses of its experiences in order of their ids. The time column holds the number of the frame
+      that created the experience; where the numbers of another session start again from a lower
+      one, the column counts on, because times must rise.
     - ``g2o``: a ``VERTEX_SE2`` for each experience, an ``EDGE_SE2`` for each link with its
       measurement :math:`(d \cos h,\; d \sin h,\; f)` of distance, heading and facing, and the
       information matrix :math:`\mathrm{diag}(\sigma_m^{-2}, \sigma_m^{-2}, \sigma_{rad}^{-2})`
       of the config; vertex 0 is fixed.
     - ``graphml``: a node for each experience with its pose, its view and its origin, a directed
-      edge for each link with all that it measured.
+      edge for each link with its measurements.
     - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
       (:func:`neuroslam.spiking.export.export_nir`, extra ``spiking-export``).
 
     Args:
         path: Brain file, or folder of a run.
-        to: File to write, whole or not at all; it is replaced if it is there.
-        kind: ``tum``, ``g2o``, ``graphml`` or ``nir``; the suffix of ``to`` if not given.
+        to: File to write, whole or not at all; an existing file is replaced.
+        kind: ``tum``, ``g2o``, ``graphml`` or ``nir``; default: the suffix of ``to``.
 
     Returns:
         ``to``.
@@ -45,20 +47,21 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
         CheckpointError: If the brain cannot be read.
         SourceError: If a run's trajectory cannot be read.
         RunError: If the kind is unknown, the map is empty or ``to`` cannot be written.
-        ConfigError: If ``nir`` is asked for and not installed, or the brain has no such neurons.
+        ConfigError: If ``nir`` is requested but not installed, or the brain has no spiking neurons.
     """
     path, to = Path(path), Path(to)
     asked = kind or to.suffix.removeprefix(".").lower()
     if asked not in _WRITERS:
         raise RunError(
-            f"{to}: no such kind of export, {asked!r}; expected tum, g2o, graphml or nir"
+            f"{to}: unknown export format {asked!r}; expected tum, g2o, graphml or nir as suffix "
+            "or --kind"
         )
     source = brain_file(path)
     if to.resolve() == source.resolve():
-        raise RunError(f"{to}: is the brain itself; take another file")
+        raise RunError(f"{to}: is the brain file to export; choose another output file")
     if asked == "tum" and path.is_dir():
         track = track_file(path)
-        read_tum(track)  # a damaged one is no export
+        read_tum(track)  # a damaged file is not exported
 
         def write() -> None:
             text = track.read_bytes()
@@ -66,7 +69,7 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
     else:
         brain = load_brain(source)
         if not brain.map.n and asked != "nir":
-            raise RunError(f"{path}: its map is empty, there is nothing to export")
+            raise RunError(f"{path}: its map is empty; nothing to export")
         write = partial(_WRITERS[asked], brain, to)
     try:
         write()
@@ -88,14 +91,14 @@ def _write_g2o(brain: NavigationBrain, to: Path) -> None:
     vertices = np.column_stack([np.arange(brain.map.n), brain.map.poses]).tolist()
     lines = [f"VERTEX_SE2 {int(i)} {x!r} {y!r} {theta!r}" for i, x, y, theta in vertices]
     lines.append("FIX 0")
-    place, turn = config.sigma_m**-2, config.sigma_rad**-2
+    position, turn = config.sigma_m**-2, config.sigma_rad**-2
     dx, dy = (
         links.distance_m * np.cos(links.heading_rad),
         links.distance_m * np.sin(links.heading_rad),
     )
     columns = (links.source, links.target, dx, dy, links.facing_rad)
     lines += [
-        f"EDGE_SE2 {i} {j} {x!r} {y!r} {facing!r} {place!r} 0 0 {place!r} 0 {turn!r}"
+        f"EDGE_SE2 {i} {j} {x!r} {y!r} {facing!r} {position!r} 0 0 {position!r} 0 {turn!r}"
         for i, j, x, y, facing in zip(*(c.tolist() for c in columns), strict=True)
     ]
     text = "\n".join(lines) + "\n"
@@ -137,13 +140,13 @@ def _write_graphml(brain: NavigationBrain, to: Path) -> None:
 def _write_nir(brain: NavigationBrain, to: Path) -> None:
     if "semantic" not in brain.populations or brain.config.semantic.tier != "spiking":
         raise ConfigError(
-            f"{to}: the brain has no spiking neurons; run it with semantic cells and "
+            f"{to}: the brain has no spiking neurons; run with semantic cells and "
             "--set semantic.tier=spiking"
         )
-    export_nir(brain.semantic.slam.integrator, to)
+    export_nir(cast(PathIntegrator, brain.semantic.slam.integrator), to)
 
 
-def _add_data(element: ElementTree.Element, columns: dict[str, list], row: int) -> None:
+def _add_data(element: ElementTree.Element, columns: dict[str, list[Any]], row: int) -> None:
     for name, values in columns.items():
         ElementTree.SubElement(element, "data", key=name).text = str(values[row])
 

@@ -1,4 +1,4 @@
-"""The files of a run: their names and columns are a contract, and nothing else writes them."""
+"""The files of a run; their names and columns are a contract."""
 
 import contextlib
 import json
@@ -23,7 +23,7 @@ FRAME_COLUMNS = (
     "x_m,y_m,theta_rad,pose_x,pose_y,pose_theta,n_templates,n_experiences,n_links"
 )
 
-# One row a frame in trace.f64: what trajectory.tum and map.png need and frames.csv lacks.
+# One row per frame of trace.f64: what trajectory.tum and map.png need beyond frames.csv.
 TRACE_COLUMNS = (
     "time_s", "session", "number", "dx_m", "dy_m", "dtheta_rad", "v_m_s", "w_rad_s", "dt_s",
     "truth_x_m", "truth_y_m", "truth_theta_rad",
@@ -34,10 +34,10 @@ RUN_FILES = (
     "experiences.csv", "links.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
 LANDMARKS_FILE = "landmarks.csv"
-"""Besides, where the brain has a semantic map; other populations may write tables, too."""
+"""Written if the brain has a semantic map; other populations can write tables of their own."""
 
 TIMINGS = ("seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s")
-"""Figures of a run that differ from one time to the next; all others do not."""
+"""Figures that differ between two runs of one source and config; all others are equal."""
 
 
 OnBadFrame = Literal["skip", "stop"]
@@ -45,7 +45,7 @@ OnBadFrame = Literal["skip", "stop"]
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a run reads and how far: the ``[run]`` table of its ``config.toml``."""
+    """The source of a run and the range of its frames: table ``[run]`` of its ``config.toml``."""
 
     source: str
     start: int = 0
@@ -55,12 +55,12 @@ class RunPlan:
 
     @property
     def name(self) -> str:
-        """The source as a reader knows it: the last two parts of its path."""
+        """Short name of the source: the last two parts of its path."""
         return "/".join(Path(self.source).parts[-2:])
 
     @property
     def skips(self) -> bool:
-        """Whether frames that cannot be used are left out."""
+        """Whether unusable frames are skipped."""
         return self.on_bad_frame == "skip"
 
     def to_toml(self) -> str:
@@ -75,61 +75,63 @@ class RunPlan:
 
 
 def brain_file(path: str | Path) -> Path:
-    """Return the brain file of a run folder, or the path itself if it is none."""
+    """Return the brain file of a run folder, or the path itself if it is no folder."""
     path = Path(path)
     refuse_many(path)
     return path / "brain.safetensors" if path.is_dir() else path
 
 
 def refuse_many(out: Path) -> None:
-    """Say what a folder is that a command for runs made no run in.
+    """Refuse the folder of a sweep, a fleet or a tuning where a run is expected.
 
     Raises:
-        RunError: If it is that of a sweep, a fleet or a tuning.
+        RunError: If it is such a folder; the message says where its runs are.
     """
     if (out / "brain.safetensors").exists() or (out / "frames.csv").exists():
         return
     if (out / "sweep.json").exists():
-        one = next((f", as {path.parent}" for path in sorted(out.glob("*/frames.csv"))), "")
-        what = f"a sweep; its runs are folders in it{one}"
+        one = next((f", e.g. {path.parent}" for path in sorted(out.glob("*/frames.csv"))), "")
+        what = f"a sweep; expected one of its runs, which are folders in it{one}"
     elif (out / "fleet.json").exists():
         merged = (out / "merged").is_dir()
-        what = f"a fleet; its {'map is in' if merged else 'maps are in'} {out}/"
+        what = f"a fleet; its {'merged map is' if merged else 'maps are'} in {out}/"
         what += "merged" if merged else "sessions"
     elif (out / "tune.json").exists():
-        what = f"a tuning; use it as --config {out}/config.toml"
+        what = f"a tuning; use its config with --config {out}/config.toml"
     else:
         return
     raise RunError(f"{out}: is {what}")
 
 
 def run_files(out: Path) -> tuple[str, ...]:
-    """Name all files of a run, those that the run in a folder wrote for its populations, too."""
+    """Name all files of a run, including the tables that its populations have written."""
     try:
         tables = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["tables"]
         own = [name for name in tables if isinstance(name, str) and Path(name).name == name]
-    except (OSError, ValueError, KeyError, TypeError):  # there is no run, or an older one
+    except (OSError, ValueError, KeyError, TypeError):  # no run, or one of an older version
         own = []
     return (*RUN_FILES, *dict.fromkeys([LANDMARKS_FILE, *own]))
 
 
 def require_free(out: Path, source: str, overwrite: bool) -> None:
-    """Make sure that a new run in a folder destroys nothing that it should not.
+    """Check that a new run in a folder overwrites neither its source nor an earlier run.
 
     Raises:
         RunError: If ``out`` is a file, is or holds the source, or holds a run already.
     """
     if out.exists() and not out.is_dir():
-        raise RunError(f"{out}: is a file; expected a folder to write")
+        raise RunError(f"{out}: is a file; expected a folder")
     written = run_files(out)
     if Path(source) in (out.resolve(), *(out.resolve() / name for name in written)):
-        raise RunError(f"{out}: is where the source is, which would change; take another folder")
+        raise RunError(f"{out}: a run here would overwrite its source; choose another folder")
     if not overwrite and any((out / name).exists() for name in written):
-        raise RunError(f"{out}: holds a run already; resume it, take another folder or --overwrite")
+        raise RunError(
+            f"{out}: holds a run already; resume it, choose another folder or use --overwrite"
+        )
 
 
 class RowWriter:
-    """Writes the two files that grow by a row a frame: ``frames.csv`` and ``trace.f64``."""
+    """Writes the two files that grow by one row per frame: ``frames.csv`` and ``trace.f64``."""
 
     def __init__(self, frames: TextIO, trace: BinaryIO) -> None:
         self.frames, self.trace = frames, trace
@@ -137,13 +139,13 @@ class RowWriter:
     @classmethod
     @contextlib.contextmanager
     def create(cls, out: Path) -> Iterator["RowWriter"]:
-        """Start the files of a new run, in place of an earlier one's."""
+        """Start the files of a new run; those of an earlier run are removed."""
         try:
             out.mkdir(parents=True, exist_ok=True)
             with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
-                _remove_halves(out)
+                _remove_partial_files(out)
                 shutil.rmtree(out / "events", ignore_errors=True)
-                for name in run_files(out)[2:]:  # none would fit the new rows
+                for name in run_files(out)[2:]:  # they belong to the earlier run
                     (out / name).unlink(missing_ok=True)
                 frames.write(FRAME_COLUMNS + "\n")
                 yield cls(frames, trace)
@@ -153,7 +155,7 @@ class RowWriter:
     @classmethod
     @contextlib.contextmanager
     def reopen(cls, out: Path, rows: int) -> Iterator["RowWriter"]:
-        """Go on after ``rows`` rows; whatever a killed run wrote after its last save is cut off."""
+        """Continue after ``rows`` rows; rows after the last save of a killed run are cut off."""
         row_bytes = 8 * len(TRACE_COLUMNS)
         try:
             with (
@@ -167,19 +169,23 @@ class RowWriter:
                 frames.seek(frames.tell())
                 frames.truncate()
                 if trace.seek(0, os.SEEK_END) < rows * row_bytes:
-                    raise RunError(f"{out}/trace.f64: shorter than the run; cannot resume")
+                    there = trace.tell() // row_bytes
+                    raise RunError(
+                        f"{out}/trace.f64: {counted(there, 'row')}, the brain has seen "
+                        f"{counted(rows, 'frame')}; cannot resume"
+                    )
                 trace.truncate(rows * row_bytes)
                 trace.seek(0, os.SEEK_END)
-                _remove_halves(out)
+                _remove_partial_files(out)
                 yield cls(frames, trace)
         except OSError as error:
             raise RunError(
-                f"{error.filename or out}: cannot be used ({error.strerror or error}); "
+                f"{error.filename or out}: cannot be opened ({error.strerror or error}); "
                 "cannot resume"
             ) from None
 
     def flush(self) -> None:
-        """Bring the rows so far to the disk: neither a kill nor a power cut loses them."""
+        """Write the rows so far to the disk, so that neither a kill nor a power cut loses them."""
         for file in (self.frames, self.trace):
             file.flush()
             os.fsync(file.fileno())
@@ -187,7 +193,7 @@ class RowWriter:
     def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
         """Append the rows of one frame."""
         motion, match, pose, cells = (
-            ",".join([repr(float(value)) for value in values])  # float: sources may hand numpy's
+            ",".join([repr(float(value)) for value in values])  # sources may return numpy scalars
             for values in (
                 (r.time_s, *r.motion[:2]),
                 (r.view.error, r.view.relative_heading_rad),
@@ -204,11 +210,11 @@ class RowWriter:
         self.trace.write(np.array(row, dtype="<f8").tobytes())
 
 
-def _remove_halves(out: Path) -> None:
-    """Remove what a run that was killed while it wrote a file has left of it."""
+def _remove_partial_files(out: Path) -> None:
+    """Remove the temporary files of a run that was killed while it wrote."""
     for name in run_files(out):
-        for half in out.glob(f".{name}.*.tmp"):
-            half.unlink(missing_ok=True)
+        for partial in out.glob(f".{name}.*.tmp"):
+            partial.unlink(missing_ok=True)
 
 
 def experiences_csv(brain: NavigationBrain) -> str:
@@ -237,12 +243,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def is_whole(line: str) -> bool:
-    """Say whether a row of ``frames.csv`` was not cut off."""
+    """Return whether a row of ``frames.csv`` is complete."""
     return line.endswith("\n") and line.count(",") == FRAME_COLUMNS.count(",")
 
 
 def missing_rows(out: str | Path, there: int, seen: int) -> str:
-    """Say that ``frames.csv`` has fewer whole rows than the brain has seen frames."""
+    """Return the message for a ``frames.csv`` that lacks rows of frames the brain has seen."""
     return (
         f"{Path(out) / 'frames.csv'}: damaged, {counted(there, 'whole row')}; "
         f"the brain has seen {counted(seen, 'frame')}"

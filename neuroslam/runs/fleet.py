@@ -1,4 +1,4 @@
-"""A fleet of robots: each maps a session of its own, then the maps are merged, as a tree."""
+"""A fleet of robots: one session per source, then a pairwise merge of the maps as a tree."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import MapError, NeuroslamError, RunError
+from neuroslam.errors import MapError, NeuroslamError, RunError, counted
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.figures.sessions import Stage, plot_stages
 from neuroslam.figures.style import SESSIONS, plain_text, save, shortened
@@ -21,7 +21,7 @@ from neuroslam.runs.files import OnBadFrame, RunPlan, brain_file, require_free, 
 from neuroslam.runs.merge import merge_runs
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.reading import read_trace, trajectory, true_poses
-from neuroslam.runs.sweep import claim, run_one, told
+from neuroslam.runs.sweep import claim, figures, run_one
 from neuroslam.sensors.open import absolute_spec
 
 REPORT = "fleet.json"
@@ -30,10 +30,10 @@ MERGED = "merged"
 
 @dataclass(frozen=True)
 class Part:
-    """A map of one session or of several that were merged.
+    """A map of one session, or of several merged ones.
 
     Attributes:
-        folder: Its run, relative to the fleet's folder.
+        folder: Folder of its run, relative to the folder of the fleet.
         sessions: Numbers of its sessions, from 1, in order.
     """
 
@@ -46,14 +46,14 @@ class Part:
 
 @dataclass
 class FleetReport:
-    """What became of a fleet: the content of ``fleet.json``.
+    """Result of a fleet: the content of ``fleet.json``.
 
     Attributes:
-        sessions: A row for each source: figures of its run, or ``error``; and ``ate_merged_m``, its
-            error on the merged map, where the truth is known.
-        tree: Each merge that was tried: level, round, the parts, and either folder or reason.
+        sessions: A row per source: figures of its run, or ``error``; and ``ate_merged_m``, its ATE
+            (rigid) on the merged map, if the truth is known.
+        tree: Each attempted merge: level, round, the two parts, and either folder or reason.
         merged: The largest map: its folder, sessions and figures; empty if nothing was merged.
-        apart: Maps that are not in it: folder, sessions, and why not.
+        apart: Maps that are not part of it: folder, sessions and reasons.
     """
 
     sessions: list[dict[str, Any]] = field(default_factory=list)
@@ -63,7 +63,7 @@ class FleetReport:
 
     @property
     def failed(self) -> list[dict[str, Any]]:
-        """Sessions that went wrong."""
+        """Sessions that failed."""
         return [row for row in self.sessions if row["error"]]
 
     def to_dict(self) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class FleetReport:
 
 @dataclass(frozen=True)
 class _Session:
-    # What a process is asked to do: everything in it can be sent to another machine.
+    # Arguments of one run: everything in it can be sent to another machine.
     source: str
     folder: Path
     config: BrainConfig
@@ -100,35 +100,35 @@ def fleet(
     overwrite: bool = False,
     on_done: Callable[[str, int, int], None] | None = None,
 ) -> FleetReport:
-    """Map each source on its own, then merge the maps pairwise until one is left, or none meet.
+    """Map each source, then merge the maps pairwise until one is left or no pair matches.
 
-    On each level of the tree neighbours are paired first. Where two maps do not meet, each is tried
-    with the nearest other map of the level that is free; who finds none waits for the next level.
-    The order of all this depends on what merges, never on what is ready first.
+    On each level of the tree neighbours are paired first. Where two maps do not match, each is
+    tried with the nearest other free map of the level; an unmerged map moves to the next level. The
+    order depends on which maps merge, never on which run ends first.
 
     Args:
-        sources: As for :func:`neuroslam.runs.run.run`: a session each.
-        out: Folder to write: ``sessions/``, ``merges/``, ``merged/`` like :func:`merge_runs` writes
-            it, ``fleet.json`` and ``fleet.png``. With Ray, on a disk that all machines share.
-        config: Of all brains; the defaults if not given.
-        preset: Name of the preset that the config is from, to be remembered.
+        sources: As for :func:`neuroslam.runs.run.run`, one session each.
+        out: Folder to write: ``sessions/``, ``merges/``, ``merged/`` as :func:`merge_runs` writes
+            it, ``fleet.json`` and ``fleet.png``. With Ray, on a disk shared by all machines.
+        config: Config of all brains; default: the default config.
+        preset: Name of the preset of the config, stored with the sessions.
         on_bad_frame: As for :func:`neuroslam.runs.run.run`.
         jobs: As for :func:`neuroslam.runs.parallel.parallel_map`.
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
         overwrite: Replace an earlier fleet in ``out``.
-        on_done: Called after each run and merge: what it was, how many are done, and of how many.
+        on_done: Called after each run and merge with the stage, the number done and the total.
 
     Returns:
-        The tree, all merge reports, what stayed apart and why. A session that fails does not stop
-        the others.
+        The tree, all merge reports, the maps that stay apart and the reasons. A session that fails
+        does not stop the others.
 
     Raises:
         RunError: If there are fewer than two sources, or ``out`` holds a fleet already or cannot be
-            written, or Ray is not to be reached.
+            written, or Ray cannot be reached.
     """
     out = Path(out).resolve()
     if len(sources) < 2:
-        raise RunError(f"a fleet has 2 sources or more, got {len(sources)}")
+        raise RunError(f"fleet: got {counted(len(sources), 'source')}; expected at least 2")
     claim(out, REPORT, overwrite)
     digits = len(str(len(sources)))
     orders = [
@@ -141,16 +141,18 @@ def fleet(
     for order in orders:
         require_free(order.folder, order.source, overwrite)
     if not overwrite and any((out / name).exists() for name in ("merges", MERGED)):
-        raise RunError(f"{out}: holds merges of a fleet; take another folder or --overwrite")
-    for name in ("merges", MERGED):  # of an earlier fleet: none would fit the new sessions
+        raise RunError(
+            f"{out}: holds merges of a fleet already; choose another folder or use --overwrite"
+        )
+    for name in ("merges", MERGED):  # of an earlier fleet, with other sessions
         shutil.rmtree(out / name, ignore_errors=True)
     (out / REPORT).unlink(missing_ok=True)
     report = FleetReport()
-    found = _all(_map, orders, jobs, ray, "sessions", on_done)
+    found = _collect(_map, orders, jobs, ray, "sessions", on_done)
     for number, (order, outcome) in enumerate(zip(orders, found, strict=True), start=1):
         row = {"session": number, "source": str(sources[number - 1])}
         folder = str(order.folder.relative_to(out))
-        report.sessions.append(row | {"folder": folder} | told(outcome, order.folder))
+        report.sessions.append(row | {"folder": folder} | figures(outcome, order.folder))
     parts = [Part(row["folder"], (row["session"],)) for row in report.sessions if not row["error"]]
     parts = _merge_all(parts, out, report, jobs, ray, on_done)
     try:
@@ -161,18 +163,18 @@ def fleet(
 
 
 def _map(order: _Session) -> dict[str, Any]:
-    given = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
-    return run_one(order.source, order.folder, order.config, **given)
+    arguments = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    return run_one(order.source, order.folder, order.config, **arguments)
 
 
 def _merge(pair: _Pair) -> list[dict[str, Any]]:
-    """Merge two; the last report says that it was done, or why not."""
+    """Merge two maps; return the reports, that of the two first."""
     _, reports = merge_runs(pair.first, pair.second, pair.out, overwrite=True)
     return [report.to_dict() for report in reports]
 
 
-def _all(
-    function: Callable,
+def _collect(
+    function: Callable[[Any], Any],
     orders: Sequence[Any],
     jobs: int | None,
     ray: str | None,
@@ -196,7 +198,7 @@ def _merge_all(
     ray: str | None,
     on_done: Callable[[str, int, int], None] | None,
 ) -> list[Part]:
-    """Merge until one map is left, or all pairs of those that are left were refused."""
+    """Merge until one map is left, or every pair of the remaining maps was refused."""
     tried: set[tuple[Part, Part]] = set()
     level, before = 0, 0
     while len(parts) > 1 and len(parts) != before:
@@ -209,7 +211,7 @@ def _merge_all(
                 for k, (a, b) in enumerate(pairs, start=1)
             ]
             made += len(pairs)
-            found = _all(_merge, orders, jobs, ray, f"merges, level {level}", on_done)
+            found = _collect(_merge, orders, jobs, ray, f"merges, level {level}", on_done)
             for pair, order, outcome in zip(pairs, orders, found, strict=True):
                 row: dict[str, Any] = {
                     "level": level, "round": turn,
@@ -232,7 +234,7 @@ def _merge_all(
 
 
 def _pairs(free: Sequence[Part], tried: set[tuple[Part, Part]]) -> Iterator[tuple[Part, Part]]:
-    """Pair the parts that were not tried with each other, neighbours first, each once."""
+    """Pair the parts that were not tried together yet, neighbours first; each part once."""
     left = dict.fromkeys(range(len(free)))
     for apart in range(1, len(free)):
         for k in range(len(free) - apart):
@@ -243,7 +245,7 @@ def _pairs(free: Sequence[Part], tried: set[tuple[Part, Part]]) -> Iterator[tupl
 
 
 def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
-    """Copy the largest map to its place, measure it, say what stayed apart, and draw."""
+    """Copy the largest map to ``merged``, measure it, list the maps apart, and draw."""
     most = max(parts, key=lambda part: len(part.sessions), default=None)
     stages, made = [], set()
     if most is not None and len(most.sessions) > 1:
@@ -277,7 +279,7 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
     if stages:
         stages.sort(key=lambda stage: not stage[0])
         title = f"A fleet of {len(report.sessions)}"
-        if report.merged:
+        if most is not None and report.merged:
             title += f": {len(most.sessions)} sessions on one map"
         title += f", {len(report.apart)} apart" if report.apart else ""
         title += f", {len(report.failed)} failed" if report.failed else ""
@@ -289,11 +291,11 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
 
 
 def _names(report: FleetReport, made: set[int]) -> list[str]:
-    """Name each session by its source; and say which made none of the places drawn, and why."""
+    """Name each session by its source, and mark those that created no drawn experience."""
     names = []
     for row in report.sessions:
         name = plain_text(f"{row['session']}: {shortened(RunPlan(row['source']).name)}")
-        without = "failed" if row["error"] else "no place of its own"
+        without = "failed" if row["error"] else "no experience of its own"
         names.append(name if row["session"] in made else f"{name}, {without}")
     return names
 
@@ -306,7 +308,7 @@ def _copy(source: Path, to: Path) -> None:
 
 
 def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport) -> None:
-    """Lay the tracks of all sessions on one map over the truth: each, and together."""
+    """Compute the ATE (rigid) of all sessions on one map, each and together."""
     tracks, truths = [], []
     for number in part.sessions:
         trace = read_trace(out / report.sessions[number - 1]["folder"])
@@ -323,21 +325,21 @@ def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport)
         for number, track, truth in zip(part.sessions, tracks, truths, strict=True):
             alone = absolute_trajectory_error(track, truth, "rigid")
             report.sessions[number - 1]["ate_merged_m"] = alone.rmse
-    except MapError:  # robots that have not moved: nothing tells how to lay a track over the truth
+    except MapError:  # robots that did not move: the alignment is undetermined
         return
 
 
 def _stage(part: Part, out: Path, report: FleetReport) -> tuple[Stage, set[int]]:
-    """Return a map as it is drawn, and the sessions that made its places."""
+    """Return a map as it is drawn, and the sessions that created its experiences."""
     brain = load_brain(brain_file(out / part.folder))
-    ids = {  # a robot that is carried, or whose recording has a gap, has several
+    ids = {  # a kidnapped robot, or a gap in a recording, makes several
         session.id: row["session"]
         for row in report.sessions
         if row["session"] in part.sessions
         for session in load_brain(brain_file(out / row["folder"])).sessions.sessions
     }
     links = brain.map.links
-    makers = [ids[one] for one in brain.map.experiences["session"].tolist()]
+    makers = [ids[session] for session in brain.map.experiences["session"].tolist()]
     stage = Stage(
         f"{'session' if len(part.sessions) == 1 else 'sessions'} {part}",
         brain.map.poses,

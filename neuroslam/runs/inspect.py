@@ -1,4 +1,4 @@
-"""What is in a brain file or a run's folder."""
+"""The content of a brain file or a run folder, as a table."""
 
 import json
 import math
@@ -15,21 +15,22 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import brain_file
+from neuroslam.state.answers import counts_of
 from neuroslam.state.sessions import Session
 
 
 def inspect(path: str | Path) -> list[tuple[str, str]]:
-    """Describe a brain for a reader: what it holds, and where that comes from.
+    """List the content of a brain and its origin.
 
     Args:
         path: Brain file, or folder of a run.
 
     Returns:
-        Name and value, a fact a row: file, counts, extent, parameters, then a row for each
-        session, each merge and each stored map that is not joined yet.
+        Rows of name and value: file, counts, extent, parameters, then one row for each session,
+        each merge and each stored map that is not joined yet.
 
     Raises:
-        CheckpointError: If the brain cannot be read; one line says why.
+        CheckpointError: If the brain cannot be read.
     """
     file = brain_file(path)
     brain = load_brain(file)
@@ -37,8 +38,8 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         about = json.loads(opened.metadata()["neuroslam"])
     status, config, log = file.stat(), brain.config, brain.sessions
     written = datetime.fromtimestamp(status.st_mtime, UTC)
-    places = brain.map.poses[:, :2]
-    width, height = np.ptp(places, axis=0) if len(places) else (0.0, 0.0)
+    positions = brain.map.poses[:, :2]
+    width, height = np.ptp(positions, axis=0) if len(positions) else (0.0, 0.0)
     rows = [
         ("file", str(file)),
         ("format", str(about["format"])),
@@ -59,28 +60,28 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         rows.append((f"session {session.name}", _session(session, made, own)))
     rows += [_merge(report) for report in log.merges]
     rows.append(("refused merges", str(len(log.refusals))))
-    for i, one in enumerate(brain.stored):
-        names = ", ".join(session.name for session in one.sessions.sessions)
-        counts = ", ".join(f"{value} {name}" for name, value in _counts(one))
+    for i, stored in enumerate(brain.stored):
+        names = ", ".join(session.name for session in stored.sessions.sessions)
+        counts = ", ".join(f"{value} {name}" for name, value in _counts(stored))
         rows.append((f"stored map {i}, not joined", f"sessions {names}: {counts}"))
     return rows
 
 
 def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
     links = brain.map.links
-    rows = [("views", str(brain.view.n))] if brain.view.n or brain.leader.needs_views else []
+    rows = [("templates", str(brain.view.n))] if brain.view.n or brain.leader.needs_views else []
     rows += [
         ("experiences", str(brain.map.n)),
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
     ]
     for population in brain.populations.values():
-        rows += [_count(name, value) for name, value in population.counts().items()]
+        rows += [_count(name, value) for name, value in counts_of(population).items()]
     return rows
 
 
 def _count(name: str, value: float) -> tuple[str, str]:
-    """Write a count for a reader; the end of its name may be its unit.
+    """Format a count; a suffix of its name can be its unit.
 
     Example:
         >>> _count("place_cells", 3), _count("lost_s", 1.25)
@@ -113,7 +114,7 @@ def _session(session: Session, made: Counter[int], own: Counter[int]) -> str:
             *([f"recorded {session.recorded}"] if session.recorded else []),
             f"{counted(session.frames, 'frame')} from frame {session.first_frame}",
             counted(made[session.id], "experience")
-            + (f" ({known} of them known)" if known else ""),
+            + (f" ({known} merged into those of other sessions)" if known else ""),
             f"began: {session.began}",
         ]
     )
@@ -125,6 +126,6 @@ def _merge(report: dict[str, Any]) -> tuple[str, str]:
     cells = "" if report["match"]["error"] is None else f"pose cells moved by {shift}, "
     return f"merge{at}", (
         f"session {report['partial_sessions'][-1]} into {', '.join(report['loaded_sessions'])}, "
-        f"{counted(report['match']['places'], 'place agrees', 'places agree')}, {cells}"
+        f"{counted(report['match']['places'], 'experience agrees', 'experiences agree')}, {cells}"
         f"map turned by {math.degrees(report['rotation_rad']):.1f} degrees"
     )

@@ -1,4 +1,4 @@
-"""Merging two finished sessions, as runs or brain files, into a folder like that of a run."""
+"""Merging of two finished sessions, given as runs or brain files, into a run folder."""
 
 import shutil
 import tempfile
@@ -23,25 +23,25 @@ from neuroslam.runs.reading import read_plan
 from neuroslam.runs.results import RunSummary, write_results
 
 _REST_LOOPS = 5000
-"""Most loops in which the merged map is relaxed; a large map goes on relaxing when it is used."""
+"""Most relaxation loops after a merge; a large map relaxes further when it is used."""
 
 
 _ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
-"""The files of a run that have a row a frame, and what they are without any."""
+"""The files of a run with one row per frame, and their content without frames."""
 
 
 def join_brains(
     loaded: NavigationBrain, partial: NavigationBrain
 ) -> tuple[NavigationBrain | None, list[MergeReport]]:
-    """Find where two finished maps meet and merge them; then the maps that either had stored.
+    """Match and merge two finished maps, then the stored maps of either.
 
     Args:
         loaded: The brain that is merged into; it is not altered.
-        partial: The brain whose session can go on afterwards; it is not altered.
+        partial: The brain whose session can be resumed afterwards; it is not altered.
 
     Returns:
-        The merged brain, or ``None`` where it is refused; and a report of each merge, the first
-        being that of the two.
+        The merged brain, or ``None`` if the merge is refused; and a report of each merge, that of
+        the two brains first.
     """
     found = find_match(loaded, partial)
     if found.match is None:
@@ -102,20 +102,20 @@ def merge_runs(
     confirm: int | None = None,
     overwrite: bool = False,
 ) -> tuple[RunSummary | None, list[MergeReport]]:
-    """Merge two finished sessions and write the files of a run; nothing if it is refused.
+    """Merge two finished sessions and write the files of a run; nothing if the merge is refused.
 
-    The folder is that of the second session, on the merged map: its frames, and ``resume`` goes on
-    with it. If that is only a brain file, there are no frames to write.
+    The folder holds the second session on the merged map: its frames are copied, and ``resume``
+    continues it. If the second is only a brain file, there are no frames to write.
 
     Args:
-        first: Run folder or brain file that is merged into: its ids stay.
-        second: Run folder or brain file of the session that can go on.
+        first: Run folder or brain file that is merged into; its ids stay.
+        second: Run folder or brain file of the session that can be resumed.
         out: Folder to write; made if missing.
-        confirm: Places that must agree; the second one's config says if not given.
+        confirm: Experiences that must agree; default: the config of the second.
         overwrite: Replace the files of an earlier run in ``out``.
 
     Returns:
-        What ``metrics.json`` holds, or ``None`` where it is refused; and the reports.
+        The content of ``metrics.json``, or ``None`` if the merge is refused; and the reports.
 
     Raises:
         CheckpointError: If a brain cannot be loaded.
@@ -126,10 +126,13 @@ def merge_runs(
     for file in files:
         require_free(out, str(file.resolve()), overwrite)
         if file.resolve().parent == out.resolve():
-            raise RunError(f"{out}: holds one of the two maps; take another folder")
+            raise RunError(f"{out}: holds one of the two maps; choose another folder")
     for name in _ROWS:
         if Path(second).is_dir() and not (Path(second) / name).is_file():
-            raise RunError(f"{Path(second) / name}: missing; give its brain file to merge without")
+            raise RunError(
+                f"{Path(second) / name}: missing; to merge the map without its frames, give "
+                f"{files[1]}"
+            )
     loaded, partial = brains
     if confirm is not None:
         sessions = partial.config.sessions.model_copy(update={"confirm": confirm})
@@ -148,7 +151,7 @@ def _plan_of(second: str | Path) -> RunPlan:
 
 
 def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> RunSummary:
-    """Write all files beside the folder first: a run that is there stays whole until they are."""
+    """Write all files beside the folder first, so that an earlier run in it stays whole."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as name:
@@ -160,11 +163,11 @@ def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> Ru
                     (beside / file).write_text(empty)
             summary = write_results(brain, plan, beside, RunSummary())
             out.mkdir(exist_ok=True)
-            # The brain first, and each once: what is not beside any more is of an earlier run.
+            # The brain first. A file that was not written now belongs to an earlier run.
             for file in dict.fromkeys(("brain.safetensors", *run_files(out), *run_files(beside))):
                 if (beside / file).exists():
                     (beside / file).replace(out / file)
-                else:  # of an earlier run: it would not fit the new map
+                else:  # it does not fit the new map
                     (out / file).unlink(missing_ok=True)
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None

@@ -1,4 +1,4 @@
-"""TensorBoard panels that collect over time what a population did, and draw it."""
+"""TensorBoard panels that sample a population over time and draw the samples."""
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
@@ -19,18 +19,18 @@ from neuroslam.state.population import Population
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-_BINS_A_FIELD = 10  # in the smallest spacing: finer ones stay unvisited for long
+_BINS_A_FIELD = 10  # of the smallest spacing: finer bins stay unvisited for long
 _LEAST_SAMPLES = 200
-_CELLS_SHOWN = 4  # of as many modules
+_CELLS_SHOWN = 4  # one of each module
 _MOST_SAMPLES = 100_000
 
 
 class Panels(ABC):
-    """Watches one population of a brain for a recorder, beyond its own scalars and images."""
+    """Panels of one population, beyond its own scalars and images."""
 
     @abstractmethod
     def note(self, population: Population) -> None:
-        """Take note of a frame; a brain that joins or starts a map has another population."""
+        """Sample a frame; a brain that joins or starts a map replaces its populations."""
 
     @abstractmethod
     def write_scalars(self, frame: int) -> None:
@@ -38,7 +38,7 @@ class Panels(ABC):
 
     @abstractmethod
     def write_figures(self, frame: int) -> None:
-        """Write figures, which cost ever more as a run goes on."""
+        """Write figures, whose cost grows with the length of a run."""
 
     @abstractmethod
     def close(self) -> None:
@@ -46,13 +46,13 @@ class Panels(ABC):
 
 
 class NavigationPanels(Panels):
-    """Draws rate maps of grid cells, responses of boundary cells and the map of place cells.
+    """Draws rate maps of grid cells, rates of boundary cells and the map of place cells.
 
-    Positions are those that the brain believes. Of a long run every other sample is dropped
-    whenever there are too many.
+    Positions are those estimated by the brain. When a long run has too many samples, every other
+    one is dropped.
 
     Args:
-        writer: Of TensorBoard.
+        writer: TensorBoard writer.
         every: Frames between two samples.
     """
 
@@ -65,7 +65,7 @@ class NavigationPanels(Panels):
         self._boundary: list[float] = []
 
     def note(self, population: Population) -> None:
-        """Take a sample, where one is due."""
+        """Take a sample if one is due."""
         assert isinstance(population, NavigationCells)
         self._cells = population
         self._seen += 1
@@ -80,7 +80,7 @@ class NavigationPanels(Panels):
                 del kept[1::2]
 
     def write_scalars(self, frame: int) -> None:
-        """Write nothing: the curves of navigation cells are their own."""
+        """Write nothing: navigation cells have scalars of their own."""
 
     def write_figures(self, frame: int) -> None:
         """Draw all panels, and write the grid scores of the modules."""
@@ -93,10 +93,10 @@ class NavigationPanels(Panels):
             self.writer.add_scalar(tag, score, frame)
 
     def close(self) -> None:
-        """Do nothing: samples are taken, not sent."""
+        """Do nothing: there is nothing to release."""
 
     def draw(self, cells: NavigationCells) -> tuple[dict[str, Figure], dict[str, float]]:
-        """Draw all panels; returns them, and the grid scores of the modules, by tag."""
+        """Return all figures, and the median grid score of each module, by tag."""
         path = np.array(self._positions).reshape(-1, 2)
         figures = {"cells/place_map": plot_place_cells(*cells.remembered(), cells.pose, path)}
         scores: dict[str, float] = {}
@@ -112,50 +112,55 @@ class NavigationPanels(Panels):
         rates = np.array(self._rates, dtype=np.float64)
         maps = rate_map(at, rates, bins)
         score = gridness(maps).reshape(-1, config.n_cells)
-        told = {
+        medians = {
             f"gridness/spacing_{spacing:.2f}_m": float(np.median(row[np.isfinite(row)]))
             for spacing, row in zip(config.spacings_m, score, strict=True)
             if np.isfinite(row).any()
         }
         shown = range(min(_CELLS_SHOWN, len(config.spacings_m)))
         with mpl.rc_context(STYLE):
-            figure = new_figure(3.0 * len(shown) + 0.4, 6.2, "Grid cells: firing, and correlation")
+            figure = new_figure(
+                3.0 * len(shown) + 0.4, 6.2, "Grid cells: rate maps and autocorrelograms"
+            )
             axes = figure.subplots(2, len(shown), squeeze=False)
-            for module, (fires, shifted) in zip(shown, axes.T, strict=True):
+            for module, (rate, correlation) in zip(shown, axes.T, strict=True):
                 one = maps[module * config.n_cells]
-                fires.imshow(one, ACTIVITY, origin="lower", extent=bins.extent_m, vmin=0.0)
-                fires.set_title(f"spacing {config.spacings_m[module]:.2f} m")
-                fires.set(xlabel="x (m)", ylabel="y (m)" if module == 0 else "")
+                rate.imshow(one, ACTIVITY, origin="lower", extent=bins.extent_m, vmin=0.0)
+                rate.set_title(f"spacing {config.spacings_m[module]:.2f} m")
+                rate.set(xlabel="x (m)", ylabel="y (m)" if module == 0 else "")
                 r = autocorrelogram(one)
                 y, x = (bins.bin_m * n / 2.0 for n in r.shape)
-                shifted.imshow(
+                correlation.imshow(
                     r, "RdBu_r", origin="lower", extent=(-x, x, -y, y), vmin=-1.0, vmax=1.0
                 )
-                shifted.set_title(f"grid score {score[module, 0]:.2f}")
-                shifted.set(xlabel="shift in x (m)", ylabel="shift in y (m)" if module == 0 else "")
-                for ax in (fires, shifted):
+                correlation.set_title(f"grid score {score[module, 0]:.2f}")
+                correlation.set(
+                    xlabel="shift in x (m)", ylabel="shift in y (m)" if module == 0 else ""
+                )
+                for ax in (rate, correlation):
                     ax.set_aspect("equal")
                     ax.grid(visible=False)
-        return figure, told
+        return figure, medians
 
     def _draw_boundary(self, at: np.ndarray) -> Figure:
         with mpl.rc_context(STYLE):
-            figure = new_figure(6.0, 5.4, "Where boundary cells respond")
+            figure = new_figure(6.0, 5.4, "Rate of boundary cells by position")
             axes = figure.subplots()
             order = np.argsort(self._boundary, kind="stable")
             dots = axes.scatter(
-                *at[order].T, c=np.array(self._boundary)[order], s=4, lw=0, cmap=ACTIVITY, vmin=0.0
-            )
+                at[order, 0], at[order, 1], c=np.array(self._boundary)[order],
+                s=4, lw=0, cmap=ACTIVITY, vmin=0.0,
+            )  # fmt: skip
             figure.colorbar(dots, ax=axes, label="rate of the most active cell")
             axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
         return figure
 
 
 class LandmarkPanels(Panels):
-    """Draws what the map of landmarks recalls, and the spikes of SSP-SLAM.
+    """Draws the recall of the semantic map and the spikes of SSP-SLAM.
 
     Args:
-        writer: Of TensorBoard.
+        writer: TensorBoard writer.
     """
 
     def __init__(self, writer: "SummaryWriter") -> None:
@@ -163,7 +168,7 @@ class LandmarkPanels(Panels):
         self._watched: tuple[SemanticCells, SemanticPanels] | None = None
 
     def note(self, population: Population) -> None:
-        """Watch the steps of SSP-SLAM."""
+        """Watch the steps of SSP-SLAM of this population."""
         assert isinstance(population, SemanticCells)
         if self._watched is not None and self._watched[0] is population:
             return
@@ -173,12 +178,12 @@ class LandmarkPanels(Panels):
         self._watched = population, panels
 
     def write_scalars(self, frame: int) -> None:
-        """Write what the last step of SSP-SLAM said."""
+        """Write the scalars of the last step of SSP-SLAM."""
         if self._watched is not None:
             self._watched[1].write_scalars(frame)
 
     def write_figures(self, frame: int) -> None:
-        """Draw what the map recalls."""
+        """Draw the recall of the semantic map."""
         if self._watched is not None:
             cells, panels = self._watched
             panels.write_pictures(frame, known_landmarks(cells))
@@ -194,4 +199,4 @@ PANELS: dict[str, type[NavigationPanels] | type[LandmarkPanels]] = {
     "place": NavigationPanels,
     "semantic": LandmarkPanels,
 }
-"""Panels of the package's own populations; all others have their scalars and images."""
+"""Panels of populations of the package; all others have their scalars and images only."""

@@ -1,6 +1,6 @@
-"""Independent pieces of work side by side: in processes of this machine, or on a Ray cluster.
+"""Independent calls in parallel: in processes of this machine, or on a Ray cluster.
 
-Each piece runs with one thread of torch and OpenCV, wherever it runs: the results are the same.
+Each call runs with one thread of torch and OpenCV, so results are equal wherever it runs.
 """
 
 import contextlib
@@ -9,12 +9,12 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import torch
@@ -28,17 +28,17 @@ R = TypeVar("R")
 def parallel_map(
     function: Callable[[T], R], items: Sequence[T], jobs: int | None = None, ray: str | None = None
 ) -> list[R]:
-    """Return ``[function(item) for item in items]``, worked out side by side.
+    """Return ``[function(item) for item in items]``, computed in parallel.
 
     Args:
-        function: Of a module, so that another process can import it; it depends on its item alone.
-        items: What it is called with.
-        jobs: So many at once; 1, or with Ray as many as it has processors, if not given.
-        ray: Address of a Ray cluster, or ``local`` to start one here; else processes are started.
+        function: Function of a module, which another process can import; depends on its item only.
+        items: Its arguments.
+        jobs: Calls at a time; default: 1, with Ray the number of processors.
+        ray: Address of a Ray cluster, or ``local`` to start one here; ``None``: processes.
 
     Raises:
-        RunError: If ``jobs`` is below 1, Ray is missing or not to be reached, or a process died.
-        Exception: The first that the function raises; the work that is left is given up.
+        RunError: If ``jobs`` is below 1, Ray is missing or cannot be reached, or a process died.
+        Exception: The first that the function raises; the remaining calls are cancelled.
 
     Example:
         >>> parallel_map(abs, [-1, 2, -3])
@@ -55,8 +55,8 @@ def parallel_map(
 
 def outcomes(
     function: Callable[[T], R], items: Sequence[T], jobs: int | None = None, ray: str | None = None
-) -> Iterator[tuple[int, R | NeuroslamError]]:
-    """Yield the number of an item and what came of it, as each is done; close it to end the rest.
+) -> Generator[tuple[int, R | NeuroslamError], None, None]:
+    """Yield the number and the outcome of each item as it ends; close to cancel the rest.
 
     Args:
         function: As for :func:`parallel_map`.
@@ -65,11 +65,11 @@ def outcomes(
         ray: As for :func:`parallel_map`.
 
     Yields:
-        The result, or the error of a user's that the function raised, or a :class:`RunError` if its
-        process died; the other items go on.
+        The result, or the :class:`~neuroslam.errors.NeuroslamError` that the function raised, or a
+        :class:`RunError` if its process died; the other items continue.
 
     Raises:
-        RunError: If ``jobs`` is below 1, Ray is missing or not to be reached.
+        RunError: If ``jobs`` is below 1, Ray is missing or cannot be reached.
 
     Example:
         >>> list(outcomes(len, ["a", "bc"]))
@@ -91,7 +91,7 @@ def outcomes(
 
 @contextlib.contextmanager
 def one_thread(n: int = 1) -> Iterator[None]:
-    """One is faster than more for one brain: its arrays are too small to share."""
+    """Limit torch and OpenCV to ``n`` threads; one is fastest for the small arrays of a brain."""
     torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(n)
     cv2.setNumThreads(n)
@@ -118,7 +118,7 @@ def _in_processes(
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
     lost: list[int] = []
     with _workers(min(jobs, len(numbered))) as pool:
-        futures: dict[Future, int] = {}
+        futures: dict[Future[R | NeuroslamError], int] = {}
         with _interrupts_wait():
             for number, item in numbered.items():
                 try:
@@ -132,7 +132,7 @@ def _in_processes(
                 lost.append(futures[future])
             else:
                 yield futures[future], outcome
-    for number in sorted(lost):  # whichever process died, all were ended: each is tried alone
+    for number in sorted(lost):  # one death ends the pool: retry each item alone
         if len(numbered) == 1:
             yield number, _died()
         else:
@@ -141,21 +141,21 @@ def _in_processes(
 
 @contextlib.contextmanager
 def _workers(n: int) -> Iterator[ProcessPoolExecutor]:
-    """Keep a pool of processes that end at once when this block is left early, or this process."""
+    """Keep a pool of processes that end when this block is left early, or this process ends."""
     context = multiprocessing.get_context("spawn")
-    held_there, held_here = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(n, context, _start_worker, (held_there,))
+    child_end, parent_end = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(n, context, _start_worker, (child_end,))
     try:
         yield pool
         pool.shutdown()
     finally:
-        held_here.close()
+        parent_end.close()
         pool.shutdown(cancel_futures=True)
-        held_there.close()
+        child_end.close()
 
 
 def _start_worker(lifeline: Connection) -> None:
-    """Ignore Ctrl-C, of which the parent knows, and end when the parent lets go of the line."""
+    """Leave Ctrl-C to the parent, and end when the parent closes its end of the pipe."""
 
     def end_with_parent() -> None:
         with contextlib.suppress(EOFError, OSError):
@@ -168,7 +168,7 @@ def _start_worker(lifeline: Connection) -> None:
 
 @contextlib.contextmanager
 def _interrupts_wait() -> Iterator[None]:
-    """Put Ctrl-C off until the end of the block; what is started in it never gets any."""
+    """Defer Ctrl-C to the end of the block; processes started in it never receive it."""
     if os.name != "posix":
         yield
         return
@@ -181,7 +181,7 @@ def _interrupts_wait() -> Iterator[None]:
 
 def _died() -> RunError:
     return RunError(
-        "its process died: out of memory, killed, or started by a script that lacks "
+        "its process died: out of memory, killed, or started by a script without "
         "`if __name__ == '__main__':`"
     )
 
@@ -194,16 +194,17 @@ def _on_ray(
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
     try:
         import ray
+        from ray.exceptions import OutOfMemoryError, WorkerCrashedError
     except ImportError as error:
         raise RunError(
-            f"Ray cannot be imported ({error}); pip install neuroslam[sweep], or leave --ray out"
+            f"Ray cannot be imported ({error}); pip install neuroslam[sweep], or omit --ray"
         ) from None
-    ours = not ray.is_initialized()
-    if ours:
+    started_here = not ray.is_initialized()
+    if started_here:
         _connect(ray, address, jobs)
-    running: dict[ray.ObjectRef, int] = {}
+    running: dict[Any, int] = {}
     try:
-        task = ray.remote(num_cpus=1, max_retries=0)(_attempt)
+        task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt)
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
@@ -213,13 +214,13 @@ def _on_ray(
             number = running.pop(done)
             try:
                 outcome = ray.get(done)
-            except (ray.exceptions.WorkerCrashedError, ray.exceptions.OutOfMemoryError):
+            except (WorkerCrashedError, OutOfMemoryError):
                 outcome = _died()
             yield number, outcome
     finally:
-        for one in running:
-            ray.cancel(one, force=True)
-        if ours:
+        for unfinished in running:
+            ray.cancel(unfinished, force=True)
+        if started_here:
             ray.shutdown()
 
 
@@ -227,12 +228,12 @@ def _connect(ray: ModuleType, address: str, jobs: int | None) -> None:
     quiet = {"log_to_driver": False, "logging_level": "error"}
     try:
         if address == "local":
-            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would tell its makers
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
             ray.init("local", num_cpus=jobs, include_dashboard=False, **quiet)
         else:
             ray.init(address, **quiet)
     except (ConnectionError, ValueError, RuntimeError) as error:
         line = " ".join(str(error).split())
         raise RunError(
-            f"--ray {address}: not to be reached ({line}); expected local, auto or HOST:PORT"
+            f"--ray {address}: cannot be reached ({line}); expected local, auto or HOST:PORT"
         ) from None

@@ -4,7 +4,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,14 +25,16 @@ from neuroslam.runs.reading import (
     trajectory,
     true_poses,
 )
+from neuroslam.state.answers import pictures_of
+from neuroslam.types import PoseEstimate
 
-_TITLE_WIDTH = 90  # letters
+_TITLE_WIDTH = 90  # characters
 
 
 def plot(out: str | Path, to: str | Path) -> list[Path]:
-    """Draw the figures of a run: map, cells at its end, recognition and counts over time.
+    """Draw the figures of a run: map, cells at its end, view matches and counts over time.
 
-    Of cells, views and walls those that the brain has are drawn.
+    Only cells, views and walls that the brain has are drawn.
 
     Returns:
         The files that were written.
@@ -45,12 +47,12 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
         to.mkdir(parents=True, exist_ok=True)
         draw_map(brain, plan, trace, to / "map.png")
         path = trajectory(brain, trace)[:, :2]
-        figures = {}
+        figures: dict[str, Figure] = {}
         for kind, population in brain.populations.items():
             if kind in _DRAWN:
                 figures |= _DRAWN[kind](population, path)
             else:
-                for tag, picture in population.images().items():
+                for tag, picture in pictures_of(population).items():
                     figures[f"{tag.replace('/', '_')}.png"] = plot_activity(picture, tag)
         figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():
@@ -61,7 +63,11 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
 
 
 def _draw_pose_cells(cells: PoseCellNetwork, _path: np.ndarray) -> dict[str, Figure]:
-    return {"pose_cells.png": plot_pose_cells(cells.activity.numpy(), cells.estimate)}
+    return {
+        "pose_cells.png": plot_pose_cells(
+            cells.activity.numpy(), cast(PoseEstimate, cells.estimate)
+        )
+    }
 
 
 def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Figure]:
@@ -71,15 +77,15 @@ def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Fig
 _DRAWN: dict[str, Callable[[Any, np.ndarray], dict[str, Figure]]] = {
     "pose": _draw_pose_cells,
     "place": _draw_place_cells,
-    "semantic": lambda _cells, _path: {},  # its landmarks are on the map
+    "semantic": lambda _cells, _path: {},  # landmarks are drawn on the map
 }
-"""Figures of the package's own populations; all others have their images drawn."""
+"""Figures of populations of the package; of all others the images are drawn."""
 
 
 def draw_map(
     brain: NavigationBrain, plan: RunPlan, trace: dict[str, np.ndarray], path: Path
 ) -> None:
-    """Draw ``map.png`` of a run: in the coordinates of its CSVs, each session in its colour."""
+    """Draw ``map.png`` of a run in the coordinates of its CSVs, one colour per session."""
     links, truth, log = brain.map.links, true_poses(trace), brain.sessions
     track = trajectory(brain, trace)[:, :2]
     on_map = np.isfinite(track[:, 0])
@@ -105,7 +111,7 @@ def draw_map(
 
 
 def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
-    """Say what is on the map, and what is on others."""
+    """Return the title: source, frames, sessions, and frames on maps that were not joined."""
     n, sources = len(on_map), dict.fromkeys(s.source for s in brain.sessions.sessions)
     title = f"{plan.name}: {counted(n, 'frame')}"
     if len(brain.sessions.sessions) > 1:
@@ -122,7 +128,7 @@ def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
 
 
 def _session_names(brain: NavigationBrain) -> list[str]:
-    """Name sessions by their sources, and where one has several by their first frames too."""
+    """Name sessions by source, and by first frame too if a source has several."""
     sessions = brain.sessions.sessions
     times = Counter(session.source for session in sessions)
     names = []

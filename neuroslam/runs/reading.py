@@ -1,4 +1,4 @@
-"""Reading the files of a run again: its rows, its plan, its figures, and where each frame was."""
+"""Readers for the files of a run: rows, plan, figures, and the pose of every frame."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, counted
 from neuroslam.geometry import integrate_velocities, wrap_angles
 from neuroslam.mapping.tables import origin_key
 from neuroslam.runs.files import (
@@ -35,61 +35,64 @@ def read_trace(
 
     Args:
         out: Folder of the run.
-        rows: So many, without what a killed run wrote after its last save; ``None``: all.
-        min_rows: It must have so many.
+        rows: Number of rows to read, without those after the last save of a killed run; ``None``:
+            all.
+        min_rows: Least number of rows expected.
 
     Raises:
-        RunError: If there is none, or it has fewer rows.
+        RunError: If it is missing or has fewer rows.
     """
     path = Path(out) / "trace.f64"
     if not path.is_file():
-        raise RunError(f"{path}: missing; is {out} a run?")
+        raise RunError(f"{path}: missing; expected the folder of a run")
     values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
     there = len(values) // width
     if not path.stat().st_size and (rows or min_rows):
-        raise RunError(f"{path}: holds no frames; was it merged from brain files alone?")
+        raise RunError(f"{path}: holds no frames; a run merged from brain files has none")
     if there < (rows or min_rows):
-        raise RunError(f"{path}: damaged, {there} whole rows; expected {rows or 'some'}")
+        raise RunError(
+            f"{path}: damaged, {counted(there, 'whole row')}; expected {rows or min_rows}"
+        )
     table = values[: (rows or there) * width].reshape(-1, width)
     return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
 
 
-def places_of(
+def experiences_of(
     brain: NavigationBrain, trace: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find where every frame was, on the final map.
+    """Return the experience of every frame on the final map.
 
     Returns:
-        Id of the experience as it is now, ``(frames,)``, -1 where it is not of this map or there
-        was none yet; and the heading that the experience was made with, minus the heading of what
-        it is now, in radians, ``(frames,)``.
+        Present id of the experience, ``(frames,)``, -1 where it is not on this map or there was
+        none yet; and the heading that the experience was created with minus the heading of the
+        experience that it has become, in radians, ``(frames,)``.
     """
     origins = brain.map.origins()
     keys = origin_key(origins._asdict())
     own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
-    place, turn_rad = np.full(len(own), NO_EXPERIENCE), np.zeros(len(own))
+    experience, turn_rad = np.full(len(own), NO_EXPERIENCE), np.zeros(len(own))
     if len(keys):
         order = np.argsort(keys)
         found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
         known = (keys[found] == own) & (trace["number"] >= 0)
-        place[known] = origins.experience[found[known]]
+        experience[known] = origins.experience[found[known]]
         turn_rad[known] = origins.turn_rad[found[known]]
-    return place, turn_rad
+    return experience, turn_rad
 
 
 def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
-    """Place every frame on the final map: each keeps its offset from its experience.
+    """Return the pose of every frame on the final map: its experience composed with its offset.
 
-    The trace may be of any session that the map holds.
+    The trace can be that of any session of the map.
 
     Returns:
-        x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the frame's place
-        is not of this map: it is of a stored one that was not joined.
+        x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the experience of
+        the frame is on a stored map that was not joined.
     """
-    place, turn_rad = places_of(brain, trace)
-    on_map = place >= 0
-    at = np.full((len(place), 3), np.nan)
-    at[on_map] = brain.map.poses[place[on_map]]
+    experience, turn_rad = experiences_of(brain, trace)
+    on_map = experience >= 0
+    at = np.full((len(experience), 3), np.nan)
+    at[on_map] = brain.map.poses[experience[on_map]]
     at[:, 2] += turn_rad
     if not brain.sessions.merges:
         at[trace["number"] < 0] = 0.0  # before the first experience
@@ -100,27 +103,27 @@ def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarr
 
 
 def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndarray:
-    """Dead-reckon the run's odometry from the map's start; shape ``(frames, 3)``."""
+    """Integrate the odometry of a run from the start of the map; shape ``(frames, 3)``."""
     start = Pose(0.0, 0.0, math.radians(config.map.initial_heading_deg))
     return integrate_velocities(trace["v_m_s"], trace["w_rad_s"], trace["dt_s"], start)
 
 
 def frame_rows(out: str | Path, rows: int | None = None) -> list[str]:
-    """Read the whole rows of ``frames.csv``, those before the first that was cut off, as text.
+    """Read the rows of ``frames.csv`` as text, up to the first incomplete row.
 
     Args:
         out: Folder of the run.
-        rows: No more than so many.
+        rows: Most rows to read; ``None``: all.
 
     Raises:
-        RunError: If there is none, or it is not text.
+        RunError: If it is missing or not text.
     """
     path = Path(out) / "frames.csv"
     try:
         with path.open(encoding="utf-8") as file:
             return list(takewhile(is_whole, islice(file, 1, None if rows is None else rows + 1)))
     except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
+        raise RunError(f"{path}: missing; expected the folder of a run") from None
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: damaged ({error})") from None
 
@@ -137,10 +140,10 @@ def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarra
 
     Args:
         out: Folder of the run.
-        rows: So many, as for :func:`read_trace`; ``None``: all that are whole.
+        rows: Number of rows, as for :func:`read_trace`; ``None``: all complete rows.
 
     Raises:
-        RunError: If there is none, or it is damaged.
+        RunError: If it is missing or damaged.
     """
     names = FRAME_COLUMNS.split(",")
     numbers = [i for i, name in enumerate(names) if name != "action"]
@@ -155,7 +158,7 @@ def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarra
 
 
 def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:
-    """Read the column of ``frames.csv`` that is no number: what was done, as text ``(frames,)``.
+    """Read the column ``action`` of ``frames.csv``, as text ``(frames,)``.
 
     Args:
         out: Folder of the run.
@@ -169,7 +172,7 @@ def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:
 
 
 def read_plan(out: str | Path) -> RunPlan:
-    """Read what a run was made from, out of its ``config.toml``.
+    """Read source and range of a run from its ``config.toml``.
 
     Raises:
         RunError: If the folder holds no run.
@@ -180,7 +183,7 @@ def read_plan(out: str | Path) -> RunPlan:
         (Path(out) / name).exists() for name in RUN_FILES[4:]
     ):
         raise RunError(
-            f"{out}: was cut off before anything was saved; run it again with --overwrite"
+            f"{out}: the run was cut off before its first save; run again with --overwrite"
         )
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
@@ -188,43 +191,43 @@ def read_plan(out: str | Path) -> RunPlan:
     except OSError:
         if (Path(out) / "brain.safetensors").exists():
             raise RunError(
-                f"{path}: is missing, and says what the run reads; put it back. The map is in "
-                f"{Path(out) / 'brain.safetensors'}, which can be used alone"
+                f"{path}: missing; it holds the source of the run. Restore it, or use "
+                f"{Path(out) / 'brain.safetensors'} alone"
             ) from None
-        raise RunError(f"{out}: not a run, it has no config.toml") from None
-    except (KeyError, TypeError, ValueError):  # not TOML, not text, or not of a run
-        raise RunError(f"{path}: has no usable [run] table; is it of a run?") from None
+        raise RunError(f"{out}: not a run; expected a folder with config.toml") from None
+    except (KeyError, TypeError, ValueError):  # not TOML, not text, or not the config of a run
+        raise RunError(f"{path}: has no valid [run] table; expected the config of a run") from None
 
 
 def read_metrics(out: str | Path) -> dict[str, Any]:
     """Read the figures of a run.
 
     Raises:
-        RunError: If there are none, or they are damaged.
+        RunError: If they are missing or damaged.
     """
     path = Path(out) / "metrics.json"
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         for name in _FIGURES:
             metrics[name]
     except FileNotFoundError:
-        raise RunError(f"{path}: missing; is {out} a run?") from None
+        raise RunError(f"{path}: missing; expected the folder of a run") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunError(f"{path}: damaged ({error})") from None
     return metrics
 
 
 def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return the true pose of every frame, ``(frames, 3)``, or ``None`` where it is not known."""
+    """Return the true pose of every frame, ``(frames, 3)``; ``None`` if one is unknown."""
     truth = np.column_stack([trace[f"truth_{name}"] for name in ("x_m", "y_m", "theta_rad")])
     return truth if np.isfinite(truth).all() else None
 
 
 def track_file(out: Path) -> Path:
-    """Return the track of a run, which is written at its end.
+    """Return the trajectory file of a run, which is written at its end.
 
     Raises:
-        RunError: If the run was killed before.
+        RunError: If the run was killed before its end.
     """
     refuse_many(out)
     track = out / "trajectory.tum"
@@ -233,5 +236,5 @@ def track_file(out: Path) -> Path:
         and (out / "brain.safetensors").exists()
         and (out / "frames.csv").exists()
     ):
-        raise RunError(f"{out}: was cut off before its end; go on with: neuroslam resume {out}")
+        raise RunError(f"{out}: the run was cut off; continue it with: neuroslam resume {out}")
     return track

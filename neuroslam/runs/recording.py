@@ -1,4 +1,4 @@
-"""Watching a run from outside: TensorBoard, or nothing; the brain itself never asks."""
+"""Recorders that watch a run: TensorBoard, or none; the brain does not depend on them."""
 
 import math
 import time
@@ -14,26 +14,28 @@ from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import render
 from neuroslam.runs.panels import PANELS, Panels
+from neuroslam.state.answers import pictures_of, scalars_of
 from neuroslam.state.population import Picture
 from neuroslam.types import Frame, StepResult
 
 if TYPE_CHECKING:
     from neuroslam.brain.brain import NavigationBrain
 
-_WIDTH = 320  # pixels of a recorded picture: a 60x10 template is too small to see
+_WIDTH = 320  # pixels of a recorded image: a 60x10 template is too small to see
+_MOST_PIXELS = 1600  # of a side of a coloured image: a row of many cells is long
 _THUMBNAIL = 48  # pixels of a template's side in the projector, whose sprite must stay small
 
 
 class Recorder(ABC):
-    """Is told of every frame after the brain has taken it in. Usable in a ``with`` statement."""
+    """Records every frame after the step of the brain. Usable in a ``with`` statement."""
 
     @abstractmethod
     def step(self, result: StepResult, frame: Frame, brain: "NavigationBrain") -> None:
-        """Take note of one frame."""
+        """Record one frame."""
 
     @abstractmethod
     def close(self) -> None:
-        """Write what is still to be written; a second call does nothing."""
+        """Write what is pending; a second call does nothing."""
 
     def __enter__(self) -> Self:
         return self
@@ -53,29 +55,29 @@ class NullRecorder(Recorder):
 
 
 class TensorBoardRecorder(Recorder):
-    """Writes event files that TensorBoard shows while the robot still runs.
+    """Writes event files that TensorBoard shows during the run.
 
     Scalars: ``view/match_error``, ``view/templates``, ``cells/peak`` (largest activity),
     ``map/experiences``, ``map/links``, ``map/largest_correction`` (relaxation residual, m or rad)
     and ``run/frames_per_s``. Images: ``view/frame_and_template``, ``cells/activity`` (x-y, and
     x-heading) and ``map/experiences_and_links``. When it closes, the templates go to the projector.
 
-    A brain with place cells has besides: how many there are, boundary cells that were activated,
-    walls, boundary activity, doubt about the place, ``gridness/...`` of each module; and the
-    images ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, ever
-    rarer as they cost ever more.
+    A brain with place cells adds: counts of place cells, activated boundary cells and walls,
+    boundary activity, position uncertainty, ``gridness/...`` of each module; and the images
+    ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, at growing
+    intervals because their cost grows.
 
-    A brain with a semantic map has besides: landmarks, how long they contradict, and of the last
-    step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate`` and ``ssp/lost``; rates of its
-    populations, where they are neurons; and as rarely as those the images ``ssp/map``, what the
-    map recalls for the landmarks seen most often, and ``ssp/spikes``.
+    A brain with a semantic map adds: the count of landmarks, for how long they disagree with the
+    estimated pose, and of the last step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate``
+    and ``ssp/lost``; rates of its spiking populations; and, at the same intervals, the images
+    ``ssp/map``, the recall of the landmarks seen most often, and ``ssp/spikes``.
 
     Args:
-        folder: Where the event files go; made if missing.
+        folder: Folder of the event files; created if missing.
         scalars_every: Frames between two points of a curve.
-        images_every: Frames between two pictures of view and cells.
-        maps_every: Frames between two drawings of the map, by far the slowest (0.1 s).
-        projected: So many templates at most, evenly picked, go to the projector.
+        images_every: Frames between two images of view and cells.
+        maps_every: Frames between two drawings of the map, the slowest part (0.1 s).
+        projected: Most templates, evenly sampled, for the projector.
 
     Raises:
         RunError: If the folder cannot be written.
@@ -89,7 +91,7 @@ class TensorBoardRecorder(Recorder):
         maps_every: int = 1000,
         projected: int = 2000,
     ) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # slow to import, for some not needed
+        from torch.utils.tensorboard import SummaryWriter  # slow to import, not always needed
 
         self.scalars_every = scalars_every
         self.images_every = images_every
@@ -104,10 +106,10 @@ class TensorBoardRecorder(Recorder):
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
         except OSError as error:
-            raise RunError(f"events folder {folder}: cannot be written ({error})") from None
+            raise RunError(f"{folder}: TensorBoard events cannot be written ({error})") from None
 
     def step(self, result: StepResult, frame: Frame, brain: "NavigationBrain") -> None:
-        """Write what is due at this frame."""
+        """Write the scalars and images that are due at this frame."""
         self._last = (result.frame, brain)
         self._seen += 1
         for kind, population in brain.populations.items():
@@ -124,13 +126,13 @@ class TensorBoardRecorder(Recorder):
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for population in brain.populations.values():
-                for tag, picture in population.images().items():
-                    self._write_picture(tag, coloured(picture), result.frame)
+                for tag, activity in pictures_of(population).items():
+                    self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
 
     def close(self) -> None:
-        """Draw the last map, hand the templates to the projector, and close the files."""
+        """Draw the final map, write the templates for the projector, and close the files."""
         if self._last is not None:
             frame, brain = self._last
             self._last = None
@@ -155,7 +157,7 @@ class TensorBoardRecorder(Recorder):
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
         for population in brain.populations.values():
-            values |= population.scalars()
+            values |= scalars_of(population)
         for panels in self._panels.values():
             panels.write_scalars(result.frame)
         for tag, value in values.items():
@@ -199,7 +201,7 @@ def frame_beside_template(image: np.ndarray, template: np.ndarray | None) -> np.
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-        template: ``uint8``, ``(h, w)``; ``None`` leaves the frame alone.
+        template: ``uint8``, ``(h, w)``; ``None``: only the frame is shown.
 
     Returns:
         ``uint8``, ``(h, 320, 3)``.
@@ -215,13 +217,14 @@ def frame_beside_template(image: np.ndarray, template: np.ndarray | None) -> np.
 
 
 def coloured(picture: Picture) -> np.ndarray:
-    """Colour the activity of a population: dark is silent, yellow the peak of each layer.
+    """Render the activity of a population as an image: dark is silent, yellow the peak of a layer.
 
-    Every cell is a block of at least 200 / n pixels, n being the smallest side; rows point up.
+    Every cell is a block of at least 200 / n pixels, n being the smallest side, or less where the
+    image would be wider or higher than 1600; the first row is lowest.
 
     Args:
-        picture: Activity ``(h, w)``; a tuple of such layers, which are put side by side; or a
-            picture that has colours already, ``uint8``, ``(h, w, 3)``.
+        picture: Activity ``(h, w)``; a tuple of such layers, drawn side by side; or an RGB image,
+            ``uint8``, ``(h, w, 3)``, returned as it is.
 
     Returns:
         ``uint8``, ``(h, w, 3)``.
@@ -234,6 +237,7 @@ def coloured(picture: Picture) -> np.ndarray:
     if layers[0].ndim == 3:
         return layers[0]
     block = math.ceil(200 / min(layers[0].shape))
+    block = max(1, min(block, _MOST_PIXELS // max(layers[0].shape)))
     height, width = (side * block for side in layers[0].shape)
     gap, parts = np.full((height, 8, 3), 255, np.uint8), []
     for layer in layers:

@@ -1,4 +1,4 @@
-"""What a run comes to: its summary, and the files that are written at its end."""
+"""Results of a run: its summary, and the files that are written at its end."""
 
 import contextlib
 import json
@@ -21,11 +21,12 @@ from neuroslam.runs.files import (
 )
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import odometry_track, read_metrics, read_trace, trajectory, true_poses
+from neuroslam.state.answers import counts_of, tables_of
 
 
 @dataclass
 class RunSummary:
-    """What a run did: the content of ``metrics.json``, and how many frames it took in just now."""
+    """Summary of a run: the content of ``metrics.json``, and the frames added by this call."""
 
     frames: int = 0
     added: int = 0
@@ -45,7 +46,7 @@ class RunSummary:
     failure: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Name every figure with its unit."""
+        """Return all figures by name; the name ends with the unit."""
         return {
             "frames": self.frames,
             "seconds": self.seconds,
@@ -71,13 +72,13 @@ class RunSummary:
 def write_results(
     brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary
 ) -> RunSummary:
-    """Write what a brain and its trace tell, as the files of a run.
+    """Write the files at the end of a run.
 
     Args:
-        brain: At the end of the run.
-        plan: What it read.
+        brain: The brain at the end of the run.
+        plan: Source and range of the run.
         out: Folder that holds ``trace.f64``.
-        summary: So far; it is completed.
+        summary: Summary so far; it is completed and returned.
 
     Raises:
         RunError: If the folder cannot be written.
@@ -102,11 +103,11 @@ def write_results(
     }
     tables: dict[str, str] = {}
     for population in brain.populations.values():
-        summary.counts |= population.counts()
-        tables |= population.tables()
+        summary.counts |= counts_of(population)
+        tables |= tables_of(population)
     summary.tables = list(tables)
     if truth is not None:
-        # A robot that has not moved: nothing tells how to lay its track over the truth.
+        # A robot that did not move: the alignment with the truth is undetermined.
         with contextlib.suppress(MapError):
             summary.accuracy = {
                 f"{name}_rmse_m": absolute_trajectory_error(
@@ -115,7 +116,7 @@ def write_results(
                 for name, xy in (("ate", track), ("odometry_ate", odometry))
             }
     try:
-        # What cannot be made again comes first: one who kills the run now can still resume it.
+        # First what cannot be derived again, so that a run killed now can still be resumed.
         save_run(brain, plan, out, summary)
         write_text(out / "experiences.csv", experiences_csv(brain))
         write_text(out / "links.csv", links_csv(brain.map.links))
@@ -129,17 +130,17 @@ def write_results(
 
 
 def save_run(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> None:
-    """Write what a run goes on from."""
+    """Write the files from which a run can be resumed."""
     write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
     write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
     save_brain(brain, out / "brain.safetensors")
 
 
 def read_summary(out: Path) -> RunSummary:
-    """Read what a run that goes on has to keep of its summary so far.
+    """Read the part of a summary that a resumed run continues.
 
     Raises:
-        RunError: If it has none, or it is damaged.
+        RunError: If ``metrics.json`` is missing or damaged.
     """
     old = read_metrics(out)
     return RunSummary(

@@ -1,4 +1,4 @@
-"""A run: a source goes through a brain, and its files are written as it goes."""
+"""A run: a brain maps a source, and the files of the run are written meanwhile."""
 
 import contextlib
 import signal
@@ -33,7 +33,7 @@ from neuroslam.sensors.open import absolute_spec
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
-"""Of the clock on the wall; what a killed run may lose."""
+"""Wall-clock seconds between two saves: what a killed run can lose."""
 
 
 def resolve_config(
@@ -44,18 +44,18 @@ def resolve_config(
     *,
     option: str = "--set",
 ) -> BrainConfig:
-    """Lay a config file over a preset, and single assignments over both.
+    """Build a config from a preset, a config file and assignments; the later ones override.
 
     Args:
-        preset: Its name.
-        config: Our TOML, or an OpenRatSLAM file.
-        assignments: Texts like ``view.threshold=0.04``.
-        base: What all is laid over where there is neither preset nor file, as a stored map's
-            config; the defaults if not given.
-        option: What the user wrote the assignments with, for messages.
+        preset: Name of a preset.
+        config: TOML file, or an OpenRatSLAM file.
+        assignments: Assignments like ``view.threshold=0.04``.
+        base: Config to start from if there is neither preset nor file, e.g. that of a stored map;
+            default: the default config.
+        option: Command-line option of the assignments, for messages.
 
     Raises:
-        ConfigError: If a preset, file, key or value cannot be used.
+        ConfigError: If a preset, file, key or value is invalid.
 
     Example:
         >>> resolve_config(assignments=("view.threshold=0.04",)).view.threshold
@@ -67,13 +67,13 @@ def resolve_config(
         values = base.model_dump(exclude_none=True)
     if config is not None:
         from_file = read_config_file(config)
-        from_file.pop("run", None)  # the table that config.toml of a run has besides
+        from_file.pop("run", None)  # table of the config.toml of a run
         values, origin = merge_values(values, from_file), f"config {config}"
     for text in assignments:
         values = merge_values(values, parse_assignment(text))
     if assignments:
         origin = option if not config else f"{origin} with {option}"
-    return _located(build_config(values, origin))
+    return _with_absolute_weights(build_config(values, origin))
 
 
 def run(
@@ -93,34 +93,35 @@ def run(
     features: nn.Module | None = None,
     save_every_s: float = SAVE_EVERY_S,
 ) -> RunSummary:
-    """Map a source and write the run's files into a folder.
+    """Map a source and write the files of the run into a folder.
 
     Args:
-        source: Anything :func:`neuroslam.sensors.open_source` opens.
-        out: Folder to write; made if missing.
-        config: Of the brain; that of the first of ``maps``, or the defaults, if not given.
-        maps: Stored maps, as run folders or brain files: each is joined when it is recognised.
-        preset: Name of the preset that the config is from, to be remembered.
+        source: Source that :func:`neuroslam.sensors.open_source` opens.
+        out: Folder to write; created if missing.
+        config: Config of the brain; default: that of the first of ``maps``, or the default config.
+        maps: Stored maps, as run folders or brain files; each is joined once it is recognised.
+        preset: Name of the preset of the config, stored with the session.
         start: First frame of the source.
-        stop: Frame to stop before; the end if not given.
-        on_bad_frame: ``stop`` at a frame that cannot be used, or ``skip`` and count it.
+        stop: Frame to stop before; default: the end.
+        on_bad_frame: ``stop`` at an unusable frame, or ``skip`` and count it.
         tensorboard: Write ``events/`` too.
         overwrite: Replace the files of an earlier run in ``out``.
-        on_step: Called after each frame, e.g. to show progress.
-        on_start: Called once, with the number of the frame to stop before; ``None``: unknown.
-        features: Network that makes views, where ``config.view.features`` is ``"module"``.
-        save_every_s: Seconds after which the brain is saved while it drives, so that a run which
-            is killed can be resumed from there; 0: only at the end.
+        on_step: Called after each frame with its result.
+        on_start: Called once with the frame to stop before; ``None``: unknown.
+        features: Network that computes views, if ``config.view.features`` is ``"module"``.
+        save_every_s: Wall-clock seconds between two saves of the brain, from which a killed run can
+            be resumed; 0: only at the end.
 
     Returns:
-        What was done; a bad frame under ``stop`` ends the run, whose files are still written,
-        with ``failure`` saying what it was.
+        Summary of the run. A bad frame under ``stop`` ends the run; its files are still written,
+        and ``failure`` holds the error.
 
     Raises:
-        SourceError: If the source cannot be opened, or has no frame in the range.
+        SourceError: If the source cannot be opened.
         CheckpointError: If a stored map cannot be loaded.
         ConfigError: If a stored map was made with another config.
-        RunError: If ``out`` holds a run already and ``overwrite`` is off, or cannot be written.
+        RunError: If the range holds no usable frame; or if ``out`` holds a run already and
+            ``overwrite`` is off, or cannot be written.
     """
     out = Path(out)
     if start < 0 or (stop is not None and stop <= start):
@@ -129,9 +130,11 @@ def run(
     plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths)
     require_free(out, plan.source, overwrite)
     if any(Path(path).parent == out.resolve() for path in paths):
-        raise RunError(f"{out}: holds the stored map, which would be lost; take another folder")
-    stored = [load_brain(path) for path in paths]  # first: nothing is written if it fails
-    config = _located(config or (stored[0].config if stored else BrainConfig()))
+        raise RunError(
+            f"{out}: holds the stored map, which would be overwritten; choose another folder"
+        )
+    stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
+    config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
     opened = open_source(source, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(
@@ -142,15 +145,21 @@ def run(
     for one in stored:
         brain.store(one)
     _announce(on_start, stop, opened)
-    with one_thread(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+    with (
+        one_thread(brain.config.threads),
+        torch.inference_mode(),
+        _noting_interrupts() as interrupts,
+    ):
         steps = _steps(brain, opened, plan, summary)
-        first = next(steps, None)  # an earlier run is not touched before this works
+        first = next(steps, None)  # an earlier run is kept if this fails
         if first is None:
             raise RunError(f"{source}: no usable frame{_and_why(summary.skipped)}")
         with RowWriter.create(out) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            keep = _keeper(brain, plan, out, summary, output, save_every_s)
-            _drive(brain, chain([first], steps), output, recorder, summary, on_step, asked, keep)
+            save = _saver(brain, plan, out, summary, output, save_every_s)
+            _drive(
+                brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
+            )
         summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
@@ -165,19 +174,19 @@ def resume(
     features: nn.Module | None = None,
     save_every_s: float = SAVE_EVERY_S,
 ) -> RunSummary:
-    """Go on where a run stopped; its files end up equal to those of an uncut run.
+    """Resume a run; its files become equal to those of an uninterrupted run.
 
     Args:
         out: Folder of the run.
-        stop: Frame to stop before; the end of the source if not given.
+        stop: Frame to stop before; default: the end of the source.
         tensorboard: Append to ``events/`` too.
         on_step: Called after each frame.
         on_start: As for :func:`run`.
-        features: The network that makes views, where one was passed to the run.
+        features: The network that computes views, if one was passed to the run.
         save_every_s: As for :func:`run`.
 
     Raises:
-        RunError: If the folder holds no run, parts of it are missing, or it is past ``stop``.
+        RunError: If the folder holds no run, files are missing, or the run is past ``stop``.
         CheckpointError: If its brain cannot be loaded.
     """
     out = Path(out)
@@ -185,17 +194,21 @@ def resume(
     brain = load_brain(out / "brain.safetensors", features=features)
     seen, first = brain.clock.frames_seen, brain.clock.frame + 1
     if stop is not None and stop < first:
-        raise RunError(f"{out}: is at frame {first} already; --stop {stop} is behind that")
+        raise RunError(f"{out}: is at frame {first}; expected --stop of at least that, got {stop}")
     opened = open_source(plan.source, brain.config.frame_rate_hz)
     summary = read_summary(out)
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
-    with one_thread(brain.config.threads), torch.inference_mode(), _asked_to_stop() as asked:
+    with (
+        one_thread(brain.config.threads),
+        torch.inference_mode(),
+        _noting_interrupts() as interrupts,
+    ):
         steps = _steps(brain, opened, onward, summary)
         with RowWriter.reopen(out, seen) as output:
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            keep = _keeper(brain, plan, out, summary, output, save_every_s)
-            _drive(brain, steps, output, recorder, summary, on_step, asked, keep)
+            save = _saver(brain, plan, out, summary, output, save_every_s)
+            _drive(brain, steps, output, recorder, summary, on_step, interrupts, save)
         summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
 
@@ -210,7 +223,7 @@ def _announce(
 def _steps(
     brain: NavigationBrain, source: Source, plan: RunPlan, summary: RunSummary
 ) -> Iterator[tuple[Frame, StepResult]]:
-    """Yield each frame with what the brain made of it; skipped ones are noted."""
+    """Yield each frame with its result; skipped frames are noted in the summary."""
     skip = (lambda fault: summary.skipped.append(str(fault))) if plan.skips else None
     for frame in source.frames(plan.start, plan.stop, skip):
         try:
@@ -231,10 +244,10 @@ def _drive(
     recorder: Recorder,
     summary: RunSummary,
     on_step: Callable[[StepResult], None] | None,
-    asked: list[int],
-    keep: Callable[[], None],
+    interrupts: list[int],
+    save: Callable[[], None],
 ) -> None:
-    wall = time.perf_counter() - summary.seconds  # a resumed run goes on counting
+    wall = time.perf_counter() - summary.seconds  # a resumed run counts on
     cpu = time.process_time() - summary.cpu_seconds
 
     def note_time() -> None:
@@ -250,18 +263,18 @@ def _drive(
                 if on_step is not None:
                     on_step(result)
                 note_time()
-                keep()
-                if asked:
+                save()
+                if interrupts:
                     break
-    except (SourceError, MapError) as error:  # what was mapped so far is kept
+    except (SourceError, MapError) as error:  # the map so far is kept
         summary.failure = str(error)
-    summary.interrupted = bool(asked)
-    # A resumed run meets again the bad frames after its last good one: they count once.
+    summary.interrupted = bool(interrupts)
+    # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))
     note_time()
 
 
-def _keeper(
+def _saver(
     brain: NavigationBrain,
     plan: RunPlan,
     out: Path,
@@ -269,18 +282,18 @@ def _keeper(
     output: RowWriter,
     every_s: float,
 ) -> Callable[[], None]:
-    """Return what saves a run that goes on still, when it is time to: a kill loses no more."""
+    """Return a function that saves the run in progress when a save is due."""
     saved = time.monotonic()
 
-    def keep() -> None:
+    def save() -> None:
         nonlocal saved
         if every_s and time.monotonic() - saved >= every_s:
-            output.flush()  # a brain must not have seen frames that have no row
+            output.flush()  # every frame that the brain has seen needs its row
             so_far = replace(summary, frames=brain.clock.frames_seen, interrupted=True)
             save_run(brain, plan, out, so_far)
             saved = time.monotonic()
 
-    return keep
+    return save
 
 
 def _and_why(skipped: list[str]) -> str:
@@ -292,31 +305,31 @@ def _and_why(skipped: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def _asked_to_stop() -> Iterator[list[int]]:
-    """Let Ctrl-C end the run after the frame in hand, so that no stage is ahead of another.
+def _noting_interrupts() -> Iterator[list[int]]:
+    """Let Ctrl-C end the run after the current frame, so that brain and files agree.
 
-    A second Ctrl-C interrupts at once. Only the main thread can take signals; and where they are
-    ignored, someone else sees to them.
+    A second Ctrl-C interrupts at once. Only the main thread receives signals; where they are
+    ignored, a parent process handles them.
     """
-    asked: list[int] = []
+    interrupts: list[int] = []
     ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     if ignored or threading.current_thread() is not threading.main_thread():
-        yield asked
+        yield interrupts
         return
 
     def note(number: int, _frame: object) -> None:
-        asked.append(number)
+        interrupts.append(number)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     before = signal.signal(signal.SIGINT, note)
     try:
-        yield asked
+        yield interrupts
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _located(config: BrainConfig) -> BrainConfig:
-    """Say where a network's weights lie from anywhere: a run may be resumed in another folder."""
+def _with_absolute_weights(config: BrainConfig) -> BrainConfig:
+    """Make the path of network weights absolute: a run can be resumed from another folder."""
     if config.view.weights is None:
         return config
     view = config.view.model_copy(update={"weights": str(Path(config.view.weights).resolve())})
@@ -333,8 +346,8 @@ def _absolute(source: str | Path) -> str:
 
 
 def recorded(source: str) -> str:
-    """Return the day on which a recording's file was written, or nothing where there is none."""
+    """Return the date of a recording's file (UTC, ISO); empty if the source is no file."""
     path = Path(source)
-    if not path.exists():  # made on the fly, or of two recordings
+    if not path.exists():  # rendered, or two recordings
         return ""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()

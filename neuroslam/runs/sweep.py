@@ -1,4 +1,4 @@
-"""Many runs side by side: sources, values of parameters and seeds, all with all, in one table."""
+"""Sweeps: runs over all combinations of sources, parameter values and seeds, in one table."""
 
 import csv
 import io
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from neuroslam.config import BrainConfig
+from neuroslam.config.populations import section_class
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
@@ -27,7 +28,7 @@ _SEEDS = {
     "place": ("grid_cells.seed",),
     "semantic": ("semantic.seed", "semantic.space.seed"),
 }
-"""Cells -> parameters that are seeds of theirs."""
+"""Kind of a population -> parameters that are its seeds; of others, ``seed`` of their section."""
 
 
 @dataclass(frozen=True)
@@ -35,21 +36,21 @@ class Trial:
     """One run of a sweep.
 
     Attributes:
-        name: Its folder.
-        source: What it maps.
-        given: What tells it from the others: the source, what is varied, the seed.
-        config: Of its brain.
+        name: Name of its folder.
+        source: Source that it maps.
+        varied: What distinguishes it from other trials: source, varied parameters, seed.
+        config: Config of its brain.
     """
 
     name: str
     source: str
-    given: dict[str, Any]
+    varied: dict[str, Any]
     config: BrainConfig
 
 
 @dataclass(frozen=True)
 class _Order:
-    # What a process is asked to do: everything in it can be sent to another machine.
+    # Arguments of one run: everything in it can be sent to another machine.
     trial: Trial
     out: Path
     preset: str
@@ -59,10 +60,10 @@ class _Order:
 
 
 def parse_values(text: str) -> tuple[str, list[Any]]:
-    """Read ``key=a,b,c``: values as in TOML, or else as text between commas.
+    """Parse ``key=a,b,c``: values in TOML syntax, else text separated by commas.
 
     Raises:
-        ConfigError: If there is no key, no value, or one twice.
+        ConfigError: If the key or a value is missing, or a value occurs twice.
 
     Example:
         >>> parse_values("view.threshold=0.03,0.05")
@@ -80,7 +81,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
             f"--vary {text!r}: expected key=a,b,c, e.g. view.threshold=0.03,0.05,0.08"
         )
     if len({_written(value) for value in values}) < len(values):
-        raise ConfigError(f"--vary {text!r}: has a value twice")
+        raise ConfigError(f"--vary {text!r}: a value occurs twice; give each value once")
     return key, values
 
 
@@ -92,20 +93,20 @@ def plan_sweep(
     config: Path | None = None,
     assignments: Sequence[str] = (),
 ) -> list[Trial]:
-    """List the runs of a sweep: each source with each of all values and each seed.
+    """List the runs of a sweep: every combination of source, parameter values and seed.
 
     Args:
         sources: As for :func:`neuroslam.runs.run.run`.
-        vary: Texts like ``view.threshold=0.03,0.05``, laid over the config.
-        seeds: So many runs of each, with seeds from 0: of the noise of worlds and arenas, and of
-            the random weights of the cells; ``None``: one run, with the seeds as they are.
-        preset: As for :func:`neuroslam.runs.run.resolve_config`, and so the next two.
+        vary: Assignments like ``view.threshold=0.03,0.05``, which override the config.
+        seeds: Runs of each combination, with seeds from 0, for the noise of worlds and arenas and
+            the random weights of cells; ``None``: one run with the configured seeds.
+        preset: As for :func:`neuroslam.runs.run.resolve_config`, like the next two.
         config: A config file.
         assignments: Single values.
 
     Raises:
-        ConfigError: If a value cannot be used.
-        SourceError: If a source has a seed, and there are ``seeds``.
+        ConfigError: If a value is invalid.
+        SourceError: If a source names a seed and ``seeds`` is given.
         RunError: If nothing is varied, or ``seeds`` would change nothing.
 
     Example:
@@ -118,60 +119,73 @@ def plan_sweep(
     """
     varied = dict(map(parse_values, vary))
     if len(varied) < len(vary):
-        raise ConfigError("--vary: the same key is given twice; put all its values into one")
+        raise ConfigError("--vary: a key is given twice; give all its values in one --vary")
     if len({str(source) for source in sources}) < len(sources):
         raise RunError("a source is given twice; give each once")
     if len(sources) < 2 and not varied and seeds is None:
         raise RunError("nothing is varied; give several sources, --vary or --seeds")
     if seeds is not None and seeds < 1:
         raise RunError(f"seeds is {seeds}; expected 1 or more")
-    ways = list(itertools.product(sources, *varied.values(), range(seeds) if seeds else (None,)))
+    combinations = list(
+        itertools.product(sources, *varied.values(), range(seeds) if seeds else (None,))
+    )
+    keys, total, many = tuple(varied), len(combinations), len(sources) > 1
     return [
-        _trial(number, len(ways), way, tuple(varied), len(sources) > 1, preset, config, assignments)
-        for number, way in enumerate(ways, start=1)
+        _trial(number, total, combination, keys, many, preset, config, assignments)
+        for number, combination in enumerate(combinations, start=1)
     ]
 
 
 def _trial(
     number: int,
     total: int,
-    way: tuple,
+    combination: tuple[Any, ...],
     keys: tuple[str, ...],
     many_sources: bool,
     preset: str | None,
     config: Path | None,
     assignments: Sequence[str],
 ) -> Trial:
-    given, *values, seed = way
-    source = absolute_spec(str(given))
+    name, *values, seed = combination
+    source = absolute_spec(str(name))
     texts = [*assignments, *(f"{key}={_written(v)}" for key, v in zip(keys, values, strict=True))]
     try:
         settings = resolve_config(
             preset, config, tuple(texts), option="--vary" if keys else "--set"
         )
     except ConfigError:
-        resolve_config(preset, config, tuple(assignments))  # a mistake in these is told as theirs
+        resolve_config(
+            preset, config, tuple(assignments)
+        )  # an error in these is reported as theirs
         raise
     if seed is not None:
-        over = [key for cells in settings.cells for key in _SEEDS.get(cells, ()) if key not in keys]
+        over = [key for kind in settings.cells for key in _seeds_of(kind) if key not in keys]
         settings = resolve_config(None, None, tuple(f"{key}={seed}" for key in over), settings)
         seeded = seeded_spec(source, seed)
         if seeded == source and not over:
             raise RunError(
-                f"--seeds: nothing is random in {given} with cells {'+'.join(settings.cells)}; "
-                "leave --seeds out"
+                f"--seeds: nothing is random in {name} with cells {'+'.join(settings.cells)}; "
+                "omit --seeds"
             )
         source = seeded
-    told: dict[str, Any] = {"source": str(given)}
-    told |= dict(zip(keys, values, strict=True))
-    words = [Path(str(given)).name[:24]] if many_sources else []
+    varied: dict[str, Any] = {"source": str(name)}
+    varied |= dict(zip(keys, values, strict=True))
+    words = [Path(str(name)).name[:24]] if many_sources else []
     for key, value in zip(keys, values, strict=True):
         words += [key.rpartition(".")[2], _written(value)]
     if seed is not None:
-        told["seed"] = seed
+        varied["seed"] = seed
         words += ["seed", str(seed)]
-    name = re.sub(r"[^\w.+]+", "-", "-".join(words)).strip("-.")[:80]
-    return Trial(f"{number:0{len(str(total))}d}-{name}", source, told, settings)
+    folder = re.sub(r"[^\w.+]+", "-", "-".join(words)).strip("-.")[:80]
+    return Trial(f"{number:0{len(str(total))}d}-{folder}", source, varied, settings)
+
+
+def _seeds_of(kind: str) -> tuple[str, ...]:
+    """Name the seeds of a population."""
+    section = section_class(kind)
+    if section is not None and "seed" in section.model_fields:
+        return (f"{kind}.seed",)
+    return _SEEDS.get(kind, ())
 
 
 def sweep(
@@ -191,35 +205,35 @@ def sweep(
     overwrite: bool = False,
     on_done: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run everything with everything, and write a summary: ``sweep.csv``, ``.json`` and ``.png``.
+    """Run all combinations, and write a summary: ``sweep.csv``, ``.json`` and ``.png``.
 
-    Each run is a folder of ``out`` like any other run's, but without ``events/``. One that fails
+    Each run has a folder in ``out`` with the files of a run, without ``events/``. A run that fails
     does not stop the others.
 
     Args:
-        sources: As for :func:`plan_sweep`, and so the next five.
-        out: Folder to write; made if missing. With Ray, on a disk that all machines share.
-        vary: What is varied.
-        seeds: How many seeds.
+        sources: As for :func:`plan_sweep`, like the next five but ``out``.
+        out: Folder to write; created if missing. With Ray, on a disk shared by all machines.
+        vary: Parameters to vary, and their values.
+        seeds: Number of seeds.
         preset: Name of a preset.
         config: A config file.
         assignments: Single values.
         start: First frame of each source.
-        stop: Frame to stop before; the end if not given.
+        stop: Frame to stop before; default: the end.
         on_bad_frame: As for :func:`neuroslam.runs.run.run`.
         jobs: As for :func:`neuroslam.runs.parallel.parallel_map`.
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
         overwrite: Replace the runs and the summary of an earlier sweep.
-        on_done: Called after each run with how many are done, and how many there are.
+        on_done: Called after each run with the number done and the total.
 
     Returns:
-        A row for each run, in order: what it was given, its figures, and ``error``, empty where it
-        went well.
+        A row for each run, in order: what is varied, its figures, and ``error``, empty on
+        success.
 
     Raises:
-        NeuroslamError: If the sweep cannot be begun: as for :func:`plan_sweep`, or ``out`` holds
-            one already or cannot be written, or Ray is not to be reached.
-        KeyboardInterrupt: If it is interrupted; the summary tells what was done until then.
+        NeuroslamError: If the sweep cannot start: as for :func:`plan_sweep`, or ``out`` holds a
+            sweep already or cannot be written, or Ray cannot be reached.
+        KeyboardInterrupt: If it is interrupted; the summary holds the runs that ended before.
     """
     out = Path(out).resolve()
     trials = plan_sweep(sources, vary, seeds, preset, config, assignments)
@@ -233,29 +247,31 @@ def sweep(
     try:
         with closing(outcomes(_map, orders, jobs, ray)) as each:
             for number, outcome in each:
-                found[number] = told(outcome, out / trials[number].name)
+                found[number] = figures(outcome, out / trials[number].name)
                 if on_done is not None:
                     on_done(len(found), len(trials))
     finally:
+        rows = [
+            {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
+            for k, trial in enumerate(trials)
+        ]
         if found:
-            rows = [
-                {"run": trial.name} | trial.given | found.get(k, {"error": "interrupted"})
-                for k, trial in enumerate(trials)
-            ]
-            _write(out, rows, [key for key in given(rows) if key not in ("run", "seed")])
+            _write(out, rows, [key for key in varied(rows) if key not in ("run", "seed")])
     return rows
 
 
 def claim(out: Path, summary: str, overwrite: bool) -> None:
-    """Make the folder of many runs, unless it holds some already.
+    """Create the folder of many runs.
 
     Raises:
-        RunError: If it does, is a file or cannot be made.
+        RunError: If it holds a summary already, is a file or cannot be created.
     """
     if out.exists() and not out.is_dir():
-        raise RunError(f"{out}: is a file; expected a folder to write")
+        raise RunError(f"{out}: is a file; expected a folder")
     if (out / summary).exists() and not overwrite:
-        raise RunError(f"{out}: holds a {summary} already; take another folder or --overwrite")
+        raise RunError(
+            f"{out}: holds a {summary} already; choose another folder or use --overwrite"
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -264,66 +280,69 @@ def claim(out: Path, summary: str, overwrite: bool) -> None:
 
 def _map(order: _Order) -> dict[str, Any]:
     trial = order.trial
-    given = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
-    given |= {"start": order.start, "stop": order.stop}
-    return run_one(trial.source, order.out / trial.name, trial.config, **given)
+    arguments: dict[str, Any] = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    arguments |= {"start": order.start, "stop": order.stop}
+    return run_one(trial.source, order.out / trial.name, trial.config, **arguments)
 
 
-def run_one(source: str, folder: Path, config: BrainConfig, **given: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Make one run of many; arguments are those of :func:`neuroslam.runs.run.run`.
+def run_one(source: str, folder: Path, config: BrainConfig, **arguments: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Run one of many; arguments are those of :func:`neuroslam.runs.run.run`.
 
     Returns:
-        Its figures, and ``error``, empty where it went well.
+        Its figures, and ``error``, empty on success.
 
     Raises:
-        KeyboardInterrupt: If it is interrupted.
+        KeyboardInterrupt: If the run is interrupted.
     """
-    # Whether it may overwrite was asked before; a process that died has left something.
-    summary = run(source, folder, config, tensorboard=False, overwrite=True, **given)
+    # Checked before that it may overwrite; a process that died can have left files.
+    summary = run(source, folder, config, tensorboard=False, overwrite=True, **arguments)
     if summary.interrupted:
         raise KeyboardInterrupt
     return summary.to_dict() | {"error": summary.failure}
 
 
-def told(outcome: dict[str, Any] | NeuroslamError, folder: Path) -> dict[str, Any]:
-    """Keep the numbers of a run's summary, and say what went wrong."""
+def figures(outcome: dict[str, Any] | NeuroslamError, folder: Path) -> dict[str, Any]:
+    """Return the numbers of a run's summary, and ``error``."""
     if isinstance(outcome, NeuroslamError):
         return {"error": str(outcome)}
     if not folder.is_dir():
-        outcome["error"] = f"{folder}: is not here; expected a disk that all machines share"
+        outcome["error"] = (
+            f"{folder}: not found here; expected --out on a disk shared by all machines"
+        )
     return {key: v for key, v in outcome.items() if isinstance(v, int | float | str)}
 
 
-def given(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the keys that tell the runs of a sweep from each other; ``run`` if none does.
+def varied(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the keys whose values differ between the runs of a sweep; ``run`` if none does.
 
     Example:
-        >>> given([{"run": "1", "source": "a", "seed": 0}, {"run": "2", "source": "a", "seed": 1}])
+        >>> rows = [{"run": "1", "source": "a", "seed": 0}, {"run": "2", "source": "a", "seed": 1}]
+        >>> varied(rows)
         ['seed']
     """
     keys = list(itertools.takewhile(lambda key: key not in ("frames", "error"), rows[0]))[1:]
     return [key for key in keys if len({str(row[key]) for row in rows}) > 1] or ["run"]
 
 
-def _write(out: Path, rows: list[dict[str, Any]], varied: list[str]) -> None:
+def _write(out: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:
     columns = list(dict.fromkeys(key for row in rows for key in row if key != "error"))
     text = io.StringIO()
     table = csv.DictWriter(text, [*columns, "error"], lineterminator="\n")
     table.writeheader()
     for row in rows:
         table.writerow({key: _written(value) for key, value in row.items()})
-    summary = {"varied": varied, "runs": rows}
+    summary = {"varied": keys, "runs": rows}
     try:
         write_text(out / "sweep.csv", text.getvalue())
         write_text(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
         if any("experiences" in row for row in rows):
-            save(plot_sweep(rows, varied), out / "sweep.png")
+            save(plot_sweep(rows, keys), out / "sweep.png")
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
 
 
 def _written(value: object) -> str:
-    """Write a value as ``--set`` reads it."""
+    """Format a value as ``--set`` reads it."""
     if isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, default=str)

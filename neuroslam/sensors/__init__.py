@@ -1,4 +1,4 @@
-"""Where frames come from: files, and worlds rendered on the fly."""
+"""Sources of frames: recordings, cameras and rendered worlds."""
 
 from neuroslam.sensors.open import open_source
 from neuroslam.sensors.source import Source

@@ -12,21 +12,21 @@ from neuroslam.sensors.images import quiet_opencv, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.types import Frame
 
-_PATIENCE = 10
-"""Pictures in a row that may fail before a camera counts as gone."""
+_MAX_FAILURES = 10
+"""Consecutive failed reads after which the camera counts as disconnected."""
 
 
 class CameraSource(Source):
-    """Pictures of a camera, in grey, as they come; it has no end, so stop it with Ctrl-C.
+    """Grey images of a live camera; it has no end, so stop it with Ctrl-C.
 
-    Times are those of the clock, in seconds since 1970, so that a run that is resumed goes on
-    later. A frame that the brain is too slow for is lost: the camera does not wait.
+    Times are Unix times in seconds, so that a resumed run continues at a later time. The camera
+    does not wait: frames that arrive while the brain is busy are lost.
 
     Args:
         device: Number of a camera of this machine, or address of a stream.
 
     Raises:
-        SourceError: If there is no such camera, or ``device`` is neither.
+        SourceError: If ``device`` is no number and no address, or the camera cannot be opened.
     """
 
     def __init__(self, device: str) -> None:
@@ -35,7 +35,7 @@ class CameraSource(Source):
         self.n_frames = None
         self.live = True
         if device == "":
-            raise SourceError("camera: has no number; expected camera:0, or an address")
+            raise SourceError("camera: has no number; expected camera:0 or an address")
         if not (device.isdecimal() or re.search(r"[/!]", device) or Path(device).exists()):
             raise SourceError(
                 f"{self.name}: {device!r} is neither a number nor an address; expected camera:0 "
@@ -49,10 +49,10 @@ class CameraSource(Source):
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
-        """Yield pictures from now on; ``start`` is the number that the first one gets.
+        """Yield images from now on; the first gets the number ``start``.
 
         Raises:
-            SourceError: If the camera gives no pictures any more.
+            SourceError: If the camera stops delivering images.
         """
         capture = self._capture()
         epoch_s, began_s = time.time(), time.monotonic()
@@ -60,13 +60,13 @@ class CameraSource(Source):
         try:
             while stop is None or index < stop:
                 with quiet_opencv():
-                    there_is_one, image = capture.read()
-                if not there_is_one:
+                    success, image = capture.read()
+                if not success:
                     missed += 1
-                    if missed >= _PATIENCE:
+                    if missed >= _MAX_FAILURES:
                         raise SourceError(
-                            f"{self.name}: gives no pictures any more, after {index - start}; "
-                            "is it unplugged?"
+                            f"{self.name}: delivers no more images after {index - start}; "
+                            "expected a live stream; check that the camera is plugged in"
                         )
                     continue
                 missed = 0
@@ -91,6 +91,7 @@ class CameraSource(Source):
         if not capture.isOpened():
             capture.release()
             raise SourceError(
-                f"{self.name}: cannot be opened; is it plugged in, and not used by another program?"
+                f"{self.name}: cannot be opened; check that it is plugged in and that no other "
+                "program uses it"
             )
         return capture

@@ -1,7 +1,7 @@
-r"""Folders as the TUM RGB-D, the KITTI odometry and the EuRoC datasets lay them out.
+r"""Folders with the layout of the TUM RGB-D, KITTI odometry and EuRoC datasets.
 
-Each has pictures with times, and may have true poses in space. The truth of a frame is the pose on
-the ground: position, and where the camera looks, seen from above.
+Each has images with times, and may have ground-truth poses in three dimensions. The truth of a
+frame is the pose projected onto the ground plane: position, and heading of the optical axis.
 
 ============  =======================================================  ======================
 TUM RGB-D     ``rgb.txt``, ``rgb/``; ``groundtruth.txt``               z is up
@@ -20,26 +20,26 @@ import numpy as np
 from neuroslam.errors import SourceError
 from neuroslam.geometry import wrap_angles
 from neuroslam.sensors.images import (
+    ImageFile,
     ImageSource,
-    Picture,
-    is_picture,
+    is_image_name,
     natural_key,
     open_image_list,
     parse_times,
     read_text,
 )
 
-FARTHEST_S = 0.1
-"""A picture farther in time than this from each known pose has no truth."""
+MAX_GAP_S = 0.1
+"""An image farther in time than this from every known pose has no truth."""
 
 _KITTI_CAMERAS = ("image_2", "image_0", "image_3", "image_1")
 
 
 def open_dataset(path: Path, frame_rate_hz: float) -> ImageSource | None:
-    """Open a folder of one of the datasets; ``None`` if it is not laid out like one.
+    """Open a folder of one of the datasets; ``None`` if it has none of their layouts.
 
     Raises:
-        SourceError: If it is, and something in it is missing or damaged.
+        SourceError: If a file of the dataset is missing or damaged.
     """
     if (path / "rgb.txt").is_file():
         return open_tum(path, frame_rate_hz)
@@ -55,28 +55,33 @@ def open_tum(path: Path, frame_rate_hz: float) -> ImageSource:
     """Open a folder of the TUM RGB-D benchmark.
 
     Raises:
-        SourceError: If a file of it is missing or damaged.
+        SourceError: If a file is missing or damaged.
     """
-    source = open_image_list(path / "rgb.txt", frame_rate_hz)
-    truth = None
+    images = open_image_list(path / "rgb.txt", frame_rate_hz)
+    times, truth = images.clock.times_s, None
     if (path / "groundtruth.txt").is_file():
+        if times is None:
+            raise SourceError(
+                f"{path / 'rgb.txt'}: has no times; expected lines 'time_s path', as the poses of "
+                "groundtruth.txt are assigned by time"
+            )
         rows = _table(path / "groundtruth.txt", 8)
         forward = _rotated(rows[:, 4:8], np.array([0.0, 0.0, 1.0]))
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
-        truth = at_times(rows[:, 0], poses, source.clock.times_s)
-    return _renamed(source, path, truth)
+        truth = at_times(rows[:, 0], poses, times)
+    return ImageSource(str(path), images.images, times, images.clock.frame_rate_hz, truth=truth)
 
 
 def open_kitti(path: Path, frame_rate_hz: float) -> ImageSource:
     """Open a sequence of the KITTI odometry benchmark.
 
     Raises:
-        SourceError: If a file of it is missing or damaged.
+        SourceError: If a file is missing or damaged.
     """
     folder = next(path / camera for camera in _KITTI_CAMERAS if (path / camera).is_dir())
-    names = sorted((f.name for f in folder.iterdir() if is_picture(f.name)), key=natural_key)
+    names = sorted((f.name for f in folder.iterdir() if is_image_name(f.name)), key=natural_key)
     if not names:
-        raise SourceError(f"{folder}: holds no pictures; expected files like 000000.png")
+        raise SourceError(f"{folder}: contains no images; expected files like 000000.png")
     times_file = path / "times.txt"
     times = parse_times(read_text(times_file), str(times_file)) if times_file.is_file() else None
     truth = None
@@ -86,19 +91,19 @@ def open_kitti(path: Path, frame_rate_hz: float) -> ImageSource:
             rows = _table(poses_file, 12)
             if len(rows) != len(names):
                 raise SourceError(
-                    f"{poses_file}: {len(rows)} poses for {len(names)} pictures; expected one each"
+                    f"{poses_file}: {len(rows)} poses for {len(names)} images; expected one each"
                 )
             truth = _on_ground(rows[:, 11], -rows[:, 3], rows[:, 10], -rows[:, 2])
             break
-    pictures = [Picture(name, folder / name) for name in names]
-    return ImageSource(str(path), pictures, times, frame_rate_hz, truth=truth)
+    images = [ImageFile(name, folder / name) for name in names]
+    return ImageSource(str(path), images, times, frame_rate_hz, truth=truth)
 
 
 def open_euroc(mav: Path, frame_rate_hz: float) -> ImageSource:
-    """Open a ``mav0`` folder of the EuRoC MAV dataset; its left camera.
+    """Open the left camera of a ``mav0`` folder of the EuRoC MAV dataset.
 
     Raises:
-        SourceError: If a file of it is missing or damaged.
+        SourceError: If a file is missing or damaged.
     """
     camera = mav / "cam0"
     lines = [line.split(",") for line in read_text(camera / "data.csv").splitlines()]
@@ -108,32 +113,32 @@ def open_euroc(mav: Path, frame_rate_hz: float) -> ImageSource:
         names = [line[1].strip() for line in lines]
     except (ValueError, IndexError):
         raise SourceError(
-            f"{camera / 'data.csv'}: is damaged; expected lines 'time in ns,name of a picture'"
+            f"{camera / 'data.csv'}: is damaged; expected lines 'time in ns,image file'"
         ) from None
     if not names:
-        raise SourceError(f"{camera / 'data.csv'}: names no pictures")
-    pictures = [Picture(name, camera / "data" / name) for name in names]
+        raise SourceError(f"{camera / 'data.csv'}: lists no images; expected one per line")
+    images = [ImageFile(name, camera / "data" / name) for name in names]
     truth = None
-    told = mav / "state_groundtruth_estimate0" / "data.csv"
-    if told.is_file():
-        rows = _table(told, 8, ",")
-        looks = _optical_axis(camera / "sensor.yaml")
-        forward = _rotated(rows[:, [5, 6, 7, 4]], looks)  # they write w first
+    truth_file = mav / "state_groundtruth_estimate0" / "data.csv"
+    if truth_file.is_file():
+        rows = _table(truth_file, 8, ",")
+        axis = _optical_axis(camera / "sensor.yaml")
+        forward = _rotated(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
         truth = at_times(rows[:, 0] * 1e-9, poses, times)
-    return ImageSource(str(mav.parent), pictures, times, frame_rate_hz, truth=truth)
+    return ImageSource(str(mav.parent), images, times, frame_rate_hz, truth=truth)
 
 
-def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray | None) -> np.ndarray:
-    """Interpolate poses on the ground to other times.
+def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Interpolate poses on the ground plane at given times.
 
     Args:
-        known_s: When the poses were, rising, ``(n,)``.
+        known_s: Times of the poses in seconds, ``(n,)``.
         poses: x, y (m) and heading (rad), ``(n, 3)``.
-        times_s: When they are asked for, ``(m,)``.
+        times_s: Times at which poses are needed, ``(m,)``.
 
     Returns:
-        Poses ``(m, 3)``, NaN where none is known within ``FARTHEST_S``.
+        Poses ``(m, 3)``, NaN where no pose is known within ``MAX_GAP_S``.
 
     Example:
         >>> poses = np.array([[0.0, 0.0, 3.0], [1.0, 0.0, -3.2]])
@@ -142,24 +147,19 @@ def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray | None)
     """
     order = np.argsort(known_s, kind="stable")
     known_s, poses = known_s[order], poses[order]
-    turned = np.unwrap(poses[:, 2])
+    unwrapped = np.unwrap(poses[:, 2])
     found = np.column_stack(
-        [np.interp(times_s, known_s, column) for column in (poses[:, 0], poses[:, 1], turned)]
+        [np.interp(times_s, known_s, column) for column in (poses[:, 0], poses[:, 1], unwrapped)]
     )
     found[:, 2] = wrap_angles(found[:, 2])
     after = np.searchsorted(known_s, times_s).clip(1, len(known_s) - 1) if len(known_s) > 1 else 0
     gaps = np.minimum(np.abs(known_s[after] - times_s), np.abs(known_s[after - 1] - times_s))
-    found[gaps > FARTHEST_S] = np.nan
+    found[gaps > MAX_GAP_S] = np.nan
     return found
 
 
-def _renamed(source: ImageSource, path: Path, truth: np.ndarray | None) -> ImageSource:
-    times, rate = source.clock.times_s, source.frame_rate_hz
-    return ImageSource(str(path), source.pictures, times, rate, truth=truth)
-
-
 def _table(path: Path, columns: int, separator: str | None = None) -> np.ndarray:
-    """Read the first columns of numbers; lines that start with ``#`` do not count."""
+    """Read the first columns of a table of numbers; lines that start with ``#`` are comments."""
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -172,16 +172,16 @@ def _table(path: Path, columns: int, separator: str | None = None) -> np.ndarray
             raise SourceError(f"{path}: line {number} is {line[:40]!r}; expected {columns} numbers")
         rows.append(row)
     if not rows:
-        raise SourceError(f"{path}: holds no poses; expected {columns} numbers a line")
+        raise SourceError(f"{path}: contains no poses; expected {columns} numbers per line")
     return np.array(rows)
 
 
 def _rotated(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Turn a vector by quaternions x, y, z, w, ``(n, 4)``; they need not be of length 1."""
+    """Rotate a vector by quaternions x, y, z, w, ``(n, 4)``, of any length."""
     q = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     axis, w = q[:, :3], q[:, 3:]
     across = np.cross(axis, vector)
-    return vector + 2.0 * (w * across + np.cross(axis, across))
+    return np.asarray(vector + 2.0 * (w * across + np.cross(axis, across)))
 
 
 def _on_ground(
@@ -191,12 +191,13 @@ def _on_ground(
 
 
 def _optical_axis(sensor: Path) -> np.ndarray:
-    """Where the camera looks, in the body's frame: the third column of ``T_BS``; x without it."""
+    """Direction of the optical axis in the body frame: third column of ``T_BS``; x without it."""
     if not sensor.is_file():
         return np.array([1.0, 0.0, 0.0])
     data = re.search(r"T_BS:.*?data:\s*\[(.*?)\]", read_text(sensor), re.DOTALL)
     try:
-        matrix = np.array([float(word) for word in data[1].split(",")]).reshape(4, 4)
-    except (TypeError, ValueError):
-        raise SourceError(f"{sensor}: has no T_BS of 16 numbers") from None
+        words = [] if data is None else data[1].split(",")
+        matrix = np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise SourceError(f"{sensor}: has no T_BS; expected a matrix of 16 numbers") from None
     return matrix[:3, 2]

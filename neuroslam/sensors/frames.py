@@ -1,8 +1,9 @@
-"""Checks of what a frame holds: a wrong shape or type is told in one line, before it is used."""
+"""Checks of a frame's data: a wrong shape or type is a one-line error before the data is used."""
 
 import math
 import numbers
 import operator
+from typing import Any
 
 import numpy as np
 
@@ -12,25 +13,31 @@ from neuroslam.types import Frame, Velocity
 _KINDS = {"U": "text", "S": "text", "O": "objects", "b": "booleans", "c": "complex numbers"}
 _LARGEST_INDEX = 2**63
 
+_FASTEST = 1e6
+"""In m/s or rad/s: no robot is faster, and far beyond it cells can no longer be counted."""
+
 
 def checked_array(
-    value: object, what: str, shape: tuple[int | None, ...], meaning: str
+    value: Any,  # noqa: ANN401
+    what: str,
+    shape: tuple[int | None, ...],
+    meaning: str,
 ) -> np.ndarray:
-    """Return an array of numbers, if it is one and has the shape that is expected.
+    """Convert a value to a ``float64`` array and check its shape.
 
-    An empty list stands for an array without rows.
+    An empty list is an array without rows.
 
     Args:
-        value: Array, or what numpy makes one of.
-        what: Name of the value in an error, plural.
+        value: Array or array-like.
+        what: Plural name of the value, for the error.
         shape: Expected shape; ``None`` stands for any length.
-        meaning: Of the numbers in it, for the error.
+        meaning: Meaning of the numbers, for the error.
 
     Returns:
-        ``float64``, of that shape; not a copy where none is needed.
+        ``float64`` array of that shape, copied only if necessary.
 
     Raises:
-        BadFrame: If it has another shape, or holds no real numbers.
+        BadFrame: If the value has another shape, or does not consist of real numbers.
 
     Example:
         >>> checked_array([[0.2, 1]], "walls", (None, 2), "distance and bearing").shape
@@ -59,15 +66,15 @@ def checked_array(
 
 
 def checked_number(value: object, what: str, unit: str) -> float:
-    """Return a number, if it is a finite one.
+    """Convert a value to a finite ``float``.
 
     Args:
-        value: Number of Python or numpy.
-        what: Name of it in an error.
-        unit: Its unit.
+        value: Python or numpy number.
+        what: Name of the value, for the error.
+        unit: Unit of the value, for the error.
 
     Raises:
-        BadFrame: If it is no number, or not finite.
+        BadFrame: If the value is no number, or not finite.
 
     Example:
         >>> checked_number("north", "heading", "rad")
@@ -78,15 +85,15 @@ def checked_number(value: object, what: str, unit: str) -> float:
         raise BadFrame(f"{what} is {_described(value)}; expected a number, in {unit}")
     number = _as_float(value)
     if not math.isfinite(number):
-        raise BadFrame(f"{what} {number:g} {unit}; expected a finite number")
+        raise BadFrame(f"{what} {number} {unit}; expected a finite number")
     return number
 
 
-def checked_odometry(velocity: object) -> Velocity:
-    """Return measured self-motion, if it is one: two finite numbers.
+def checked_odometry(velocity: Any) -> Velocity:  # noqa: ANN401
+    """Convert measured self-motion to a :class:`Velocity` of two finite numbers up to 1e6.
 
     Raises:
-        BadFrame: If it is not.
+        BadFrame: If it is anything else.
 
     Example:
         >>> checked_odometry((1, 0.5))
@@ -97,35 +104,39 @@ def checked_odometry(velocity: object) -> Velocity:
     """
     try:
         v, w = velocity
-        right = _is_number(v) and _is_number(w)
     except (TypeError, ValueError):  # not a sequence, or of another length
-        right = False
-    if not right:
+        v = w = None
+    if not (_is_number(v) and _is_number(w)):
         raise BadFrame(
             f"odometry is {_described(velocity)}; expected speed (m/s) and turn rate (rad/s)"
         )
     v, w = _as_float(v), _as_float(w)
     if not (math.isfinite(v) and math.isfinite(w)):
-        raise BadFrame(f"odometry v = {v:g} m/s, w = {w:g} rad/s; expected finite numbers")
+        raise BadFrame(f"odometry v = {v} m/s, w = {w} rad/s; expected finite numbers")
+    if max(abs(v), abs(w)) > _FASTEST:
+        raise BadFrame(
+            f"odometry v = {v} m/s, w = {w} rad/s; expected at most {_FASTEST:g}: check the "
+            "units of the source"
+        )
     return Velocity(v, w)
 
 
 def check_instant(frame: Frame) -> None:
-    """Check number and time of a frame.
+    """Check the index and the time of a frame.
 
     Raises:
-        BadFrame: If the number is not whole, or the time no finite number.
+        BadFrame: If the index is no whole number, or the time no finite number.
 
     Example:
         >>> check_instant(Frame(0, math.nan))
         Traceback (most recent call last):
-        neuroslam.errors.BadFrame: time nan s; times must rise, and be finite numbers
+        neuroslam.errors.BadFrame: time nan s; times must rise and be finite numbers
     """
     try:
-        right = -_LARGEST_INDEX <= operator.index(frame.index) < _LARGEST_INDEX
+        valid = -_LARGEST_INDEX <= operator.index(frame.index) < _LARGEST_INDEX
     except TypeError:
-        right = False
-    if not right:
+        valid = False
+    if not valid:
         raise BadFrame(
             f"its index is {_described(frame.index)}; expected a whole number of 64 bits"
         )
@@ -133,50 +144,50 @@ def check_instant(frame: Frame) -> None:
         raise BadFrame(f"its time is {_described(frame.time_s)}; expected a number, in s")
     time_s = _as_float(frame.time_s)
     if not math.isfinite(time_s):
-        raise BadFrame(f"time {time_s:g} s; times must rise, and be finite numbers")
+        raise BadFrame(f"time {time_s} s; times must rise and be finite numbers")
 
 
-def check_picture(image: object, who: str = "") -> None:
-    """Check that a picture is ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB, not empty.
+def check_image(image: object, user: str = "") -> None:
+    """Check that an image is ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB, and not empty.
 
     Args:
-        image: The picture.
-        who: What it is for, at the start of the error.
+        image: The image.
+        user: Component that needs the image; the error starts with it.
 
     Raises:
-        BadFrame: If it is of another type or shape.
+        BadFrame: If the image has another type or shape.
     """
     if isinstance(image, np.ndarray):
-        right = image.ndim == 2 or image.shape[2:] == (3,)
-        if image.dtype == np.uint8 and right and image.size:
+        fits = image.ndim == 2 or image.shape[2:] == (3,)
+        if image.dtype == np.uint8 and fits and image.size:
             return
         got = f"{image.dtype} {image.shape}"
     else:
-        got = f"{_described(image)}, no array of numpy"
-    who = f"{who}: " if who else ""
-    raise BadFrame(f"{who}picture is {got}; expected uint8, (h, w) or (h, w, 3)")
+        got = f"{_described(image)}, not a numpy array"
+    user = f"{user}: " if user else ""
+    raise BadFrame(f"{user}image is {got}; expected uint8, (h, w) or (h, w, 3)")
 
 
 def _is_number(value: object) -> bool:
-    """Tell whether a value is one real number: of Python, of numpy, or an array of one."""
+    """Return whether a value is one real number: Python's, numpy's, or a 0-d array."""
     if isinstance(value, np.ndarray):
         return value.shape == () and value.dtype.kind in "iuf"
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
-def _as_float(value: numbers.Real) -> float:
+def _as_float(value: Any) -> float:  # noqa: ANN401
     try:
         return float(value)
     except OverflowError:  # a whole number of more than 300 digits
         return math.inf
 
 
-def _described(value: object) -> str:
+def _described(value: Any) -> str:  # noqa: ANN401
     """Describe a value of a wrong type in a few words."""
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         kind = _KINDS.get(getattr(value.dtype, "kind", ""), str(value.dtype))
         return f"an array of {kind} of shape {tuple(value.shape)}"
     if value is None or isinstance(value, str | bytes | numbers.Number):
-        said = repr(value)
-        return said if len(said) <= 40 else f"{said[:37]}..."
+        text = repr(value)
+        return text if len(text) <= 40 else f"{text[:37]}..."
     return f"of type {type(value).__name__}"

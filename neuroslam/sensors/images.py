@@ -1,13 +1,13 @@
-"""Pictures in a folder, in a tar, or named in a list; beside them their times and motion.
+"""Sources of images: a folder, a tar, or an image list; with times and motion if there are any.
 
-A folder or a tar (also ``.tar.gz``, ``.tar.bz2``, ``.tar.xz``) holds pictures, taken in the natural
-order of their names (2.jpg before 10.jpg). It may hold ``times.txt`` or ``times.csv``, a time in
-seconds a line, and ``odometry.csv``, a motion CSV (:mod:`neuroslam.sensors.tracks`), each with as
-many lines as there are pictures.
+A folder or a tar (also ``.tar.gz``, ``.tar.bz2``, ``.tar.xz``) contains images in the natural order
+of their names (2.jpg before 10.jpg). It may contain ``times.txt`` or ``times.csv``, one time in
+seconds per line, and ``odometry.csv``, a motion CSV (:mod:`neuroslam.sensors.tracks`), each with
+one line per image.
 
 An image list is a text or CSV file whose lines are ``time_s path`` or ``path time_s``, separated by
-a comma or blanks, or the path alone. Paths are relative to the list; lines that start with ``#``
-and a header line do not count.
+a comma or blanks, or the path alone. Paths are relative to the list; a header line and lines that
+start with ``#`` are skipped.
 """
 
 import lzma
@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,8 +31,8 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".p
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 
-class Picture(NamedTuple):
-    """Where the bytes of a picture are: a file, a part of a file, or already here."""
+class ImageFile(NamedTuple):
+    """Location of an encoded image: a file, a part of a file, or bytes in memory."""
 
     name: str
     path: Path
@@ -41,7 +41,7 @@ class Picture(NamedTuple):
     data: bytes | None = None
 
     def read(self) -> bytes:
-        """Return the encoded picture."""
+        """Return the bytes of the encoded image."""
         if self.data is not None:
             return self.data
         with self.path.open("rb") as file:
@@ -50,24 +50,26 @@ class Picture(NamedTuple):
 
 
 class ImageSource(IndexedSource):
-    """Frames with a picture each.
+    """Source whose every frame has an image.
 
     Args:
-        name: The source, for messages.
-        pictures: In the order of the frames.
-        times_s: Their times, or ``None``: those of the motion, or else ``index / frame_rate_hz``.
-        frame_rate_hz: Frames per second where there are no times.
-        motion: Measured motion, a row a picture.
+        name: Name of the source, for messages.
+        images: Image of each frame, in order.
+        times_s: Time of each frame; ``None``: the motion's times, or else
+            ``index / frame_rate_hz``.
+        frame_rate_hz: Frames per second if there are no times.
+        motion: Measured motion, one row per image.
         truth: True poses, ``(n, 3)``, NaN where unknown; ``None``: those of the motion, if any.
 
     Raises:
-        SourceError: If no picture can be decoded, or the times or the motion are not as many.
+        SourceError: If no image can be decoded, or the number of times or of motions differs from
+            that of the images.
     """
 
     def __init__(
         self,
         name: str,
-        pictures: list[Picture],
+        images: list[ImageFile],
         times_s: np.ndarray | None,
         frame_rate_hz: float,
         motion: Track | None = None,
@@ -75,40 +77,38 @@ class ImageSource(IndexedSource):
     ) -> None:
         self.name = name
         self.truth = truth if truth is not None or motion is None else motion.truth
-        self.pictures = pictures
-        self.n_frames = len(pictures)
+        self.images = images
+        self.n_frames = len(images)
         self.motion = motion
         if motion is not None:
-            self._require_as_many(len(motion.velocities), f"lines of motion in {motion.name}")
+            self._require_one_each(len(motion.velocities), f"lines of motion in {motion.name}")
             times_s = motion.times_s if times_s is None else times_s
         if times_s is not None:
-            self._require_as_many(len(times_s), "times")
+            self._require_one_each(len(times_s), "times")
         self.clock = Clock(name, times_s, frame_rate_hz)
         self.frame_rate_hz = self.clock.frame_rate_hz
         self.image_shape = self._first_shape()
 
     def frame(self, index: int) -> Frame:
-        """Make the frame of that number, see :meth:`IndexedSource.frame`."""
+        """Return the frame of that index, see :meth:`IndexedSource.frame`."""
         time_s = self.clock.at(index)
         velocity = None if self.motion is None else self.motion.velocity(index)
         truth = None if self.truth is None else self.truth[index]
         truth = None if truth is None or not np.isfinite(truth).all() else Pose(*truth.tolist())
         image = self._decoded(index)
-        require_shape(image, self.image_shape, self.name, index, self.pictures[index].name)
+        require_shape(image, self.image_shape, self.name, index, self.images[index].name)
         return Frame(index, time_s, image=image, velocity=velocity, truth=truth)
 
     def _decoded(self, index: int) -> np.ndarray:
-        picture = self.pictures[index]
+        file = self.images[index]
         try:
-            image = decode_grey(picture.read())
+            image = decode_grey(file.read())
         except OSError as error:
             raise BadFrame(
-                f"{self.name}: frame {index}: {picture.name} cannot be read ({error.strerror})"
+                f"{self.name}: frame {index}: {file.name} cannot be read ({error.strerror})"
             ) from None
         if image is None:
-            raise BadFrame(
-                f"{self.name}: frame {index}: {picture.name} is corrupt or not a picture"
-            )
+            raise BadFrame(f"{self.name}: frame {index}: {file.name} is corrupt or not an image")
         return image
 
     def _first_shape(self) -> tuple[int, ...]:
@@ -121,41 +121,41 @@ class ImageSource(IndexedSource):
         others = f"; and so are all {self.n_frames} frames" if self.n_frames > 1 else ""
         raise SourceError(f"{first_fault}{others}") from None
 
-    def _require_as_many(self, n: int, what: str) -> None:
+    def _require_one_each(self, n: int, what: str) -> None:
         if n != self.n_frames:
             raise SourceError(
-                f"{self.name}: {n} {what} for {counted(self.n_frames, 'picture')}; "
-                "expected one each"
+                f"{self.name}: {n} {what} for {counted(self.n_frames, 'image')}; "
+                "expected one per image"
             )
 
 
 def require_shape(
-    image: np.ndarray, expected: tuple[int, ...], source: str, index: int, picture: str = ""
+    image: np.ndarray, expected: tuple[int, ...], source: str, index: int, file: str = ""
 ) -> None:
-    """Refuse a frame that is not as large as the others.
+    """Check that an image has the size of the images before it.
 
     Raises:
-        BadFrame: Names the frame and both sizes.
+        BadFrame: If it has another size; the message gives the frame and both sizes.
     """
     if image.shape != expected:
         (h, w), (h0, w0) = image.shape[:2], expected[:2]
         raise BadFrame(
-            f"{source}: frame {index}{f' ({picture})' if picture else ''} is {w} x {h} px; "
-            f"expected {w0} x {h0} px as before it"
+            f"{source}: frame {index}{f' ({file})' if file else ''} is {w} x {h} px; "
+            f"expected {w0} x {h0} px as in the frames before it"
         )
 
 
 def decode_grey(data: bytes) -> np.ndarray | None:
-    """Decode a picture to grey, by way of colour: a JPEG's own luminance is rounded otherwise.
+    """Decode an image to grey by way of colour, as a JPEG's own luminance is rounded differently.
 
     Returns:
-        ``uint8``, ``(h, w)``, or ``None`` if the bytes are not a whole picture.
+        ``uint8``, ``(h, w)``, or ``None`` if the bytes are not a complete image.
 
     Example:
         >>> decode_grey(cv2.imencode(".png", np.full((2, 3), 7, np.uint8))[1].tobytes()).tolist()
         [[7, 7, 7], [7, 7, 7]]
     """
-    if not data or not _is_whole(data):
+    if not data or not _is_complete(data):
         return None
     with quiet_opencv():
         try:
@@ -165,8 +165,8 @@ def decode_grey(data: bytes) -> np.ndarray | None:
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def _is_whole(data: bytes) -> bool:
-    """Tell a cut JPEG or a damaged PNG, of which decoders show what there is, and print."""
+def _is_complete(data: bytes) -> bool:
+    """Return False for a truncated JPEG or a damaged PNG, which decoders accept with a warning."""
     if data.startswith(b"\xff\xd8"):  # the end marker comes after the last start of a scan
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     if data.startswith(_PNG_HEAD):
@@ -182,7 +182,7 @@ def _is_whole(data: bytes) -> bool:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from printing: what goes wrong is said once, by us."""
+    """Keep OpenCV from printing: errors are reported once, as exceptions."""
     log = cv2.utils.logging
     before = log.setLogLevel(log.LOG_LEVEL_SILENT)
     try:
@@ -192,25 +192,25 @@ def quiet_opencv() -> Iterator[None]:
 
 
 def open_folder(path: Path, frame_rate_hz: float) -> ImageSource:
-    """Open a folder of pictures.
+    """Open a folder of images.
 
     Raises:
-        SourceError: If there are none, or what lies beside them cannot be used.
+        SourceError: If it contains no images, or its times or motion cannot be used.
     """
     files = {file.name: file for file in path.iterdir() if file.is_file()}
-    pictures = [Picture(name, file) for name, file in files.items() if is_picture(name)]
+    images = [ImageFile(name, file) for name, file in files.items() if is_image_name(name)]
     notes = {name: read_text(file) for name, file in files.items() if name in _NOTES}
-    return _with_notes(str(path), pictures, notes, frame_rate_hz)
+    return _with_notes(str(path), images, notes, frame_rate_hz)
 
 
 def open_tar(path: Path, frame_rate_hz: float) -> ImageSource:
-    """Open a tar of pictures; nothing is unpacked to disk.
+    """Open a tar of images; nothing is unpacked to disk.
 
-    A plain tar is read where the pictures lie in it. A compressed one cannot be, so its pictures
-    are kept in memory, encoded as they are.
+    The images of a plain tar are read in place; those of a compressed tar are kept in memory,
+    encoded.
 
     Raises:
-        SourceError: If the tar is damaged or holds no pictures.
+        SourceError: If the tar is damaged or contains no images.
     """
     try:
         try:
@@ -218,64 +218,67 @@ def open_tar(path: Path, frame_rate_hz: float) -> ImageSource:
         except tarfile.ReadError:
             members = _list_tar(path, "r:*")
     except (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError) as error:
-        said = (str(error) or type(error).__name__).splitlines()[0]
-        raise SourceError(f"{path}: is not a whole tar file ({said})") from None
-    pictures = [member for member in members if is_picture(member.name)]
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise SourceError(
+            f"{path}: is damaged or incomplete ({reason}); expected a tar file"
+        ) from None
+    images = [member for member in members if is_image_name(member.name)]
     notes = {
         note: to_text(member.read(), f"{path}: {member.name}")
         for member in members
         if (note := member.name.rpartition("/")[2]) in _NOTES
     }
-    return _with_notes(str(path), pictures, notes, frame_rate_hz)
+    return _with_notes(str(path), images, notes, frame_rate_hz)
 
 
-def _list_tar(path: Path, mode: str) -> list[Picture]:
-    found = {}
+def _list_tar(path: Path, mode: Literal["r:", "r:*"]) -> list[ImageFile]:
+    found: dict[str, ImageFile] = {}
     with tarfile.open(path, mode) as tar:
         for member in tar:
-            wanted = is_picture(member.name) or member.name.rpartition("/")[2] in _NOTES
+            wanted = is_image_name(member.name) or member.name.rpartition("/")[2] in _NOTES
             if member.isreg() and wanted:
-                data = None if mode == "r:" else tar.extractfile(member).read()
-                found[member.name] = Picture(
+                content = None if mode == "r:" else tar.extractfile(member)
+                data = None if content is None else content.read()
+                found[member.name] = ImageFile(
                     member.name, path, member.offset_data, member.size, data
                 )
     return list(found.values())
 
 
 def open_image_list(path: Path, frame_rate_hz: float) -> ImageSource:
-    """Open an image list, as the head of this module describes it.
+    """Open an image list; the module's docstring describes its format.
 
     Raises:
-        SourceError: If a line cannot be read, some have times and some not, or there are none.
+        SourceError: If a line cannot be read, only some lines have times, or there are no lines.
     """
     entries = parse_image_list(read_text(path), str(path))
-    pictures = [Picture(name, path.parent / name) for name, _ in entries]
+    images = [ImageFile(name, path.parent / name) for name, _ in entries]
     times = [time_s for _, time_s in entries]
     if times.count(None) not in (0, len(times)):
-        without = pictures[times.index(None)].name
-        raise SourceError(f"{path}: {without} has no time and others have; expected all or none")
-    return ImageSource(
-        str(path), pictures, None if None in times else np.array(times), frame_rate_hz
-    )
+        without = images[times.index(None)].name
+        raise SourceError(
+            f"{path}: {without} has no time, but others do; expected a time for all or none"
+        )
+    return ImageSource(str(path), images, None if None in times else np.array(times), frame_rate_hz)
 
 
 def parse_image_list(text: str, name: str) -> list[tuple[str, float | None]]:
     r"""Read the paths and times of an image list.
 
     Raises:
-        SourceError: If a line is neither, or there is none.
+        SourceError: If a line has another format, or there are no lines.
 
     Example:
         >>> parse_image_list("# time path\n0.5 a.png\nb/c d.png, 1.5\n", "list.txt")
         [('a.png', 0.5), ('b/c d.png', 1.5)]
     """
-    entries = []
+    entries: list[tuple[str, float | None]] = []
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
         if not line or line.startswith("#"):
             continue
         path, time_s = _path_and_time(line)
-        if time_s is None and not is_picture(path):
+        if time_s is None and not is_image_name(path):
             if not entries and "." not in line:  # a header
                 continue
             raise SourceError(
@@ -283,7 +286,7 @@ def parse_image_list(text: str, name: str) -> list[tuple[str, float | None]]:
             )
         entries.append((path, time_s))
     if not entries:
-        raise SourceError(f"{name}: names no pictures; expected lines like 'time_s path'")
+        raise SourceError(f"{name}: lists no images; expected lines like 'time_s path'")
     return entries
 
 
@@ -303,7 +306,7 @@ def _time(text: str) -> float | None:
 
 
 def parse_times(text: str, name: str) -> np.ndarray:
-    r"""Read a time in seconds a line; lines that start with ``#`` and a header do not count.
+    r"""Read one time in seconds per line; a header and lines that start with ``#`` are skipped.
 
     Raises:
         SourceError: If a line is not a number.
@@ -327,29 +330,31 @@ _NOTES = ("times.txt", "times.csv", "odometry.csv")
 
 
 def _with_notes(
-    name: str, pictures: list[Picture], notes: dict[str, str], frame_rate_hz: float
+    name: str, images: list[ImageFile], notes: dict[str, str], frame_rate_hz: float
 ) -> ImageSource:
-    if not pictures:
-        raise SourceError(f"{name}: holds no pictures; expected files like {IMAGE_SUFFIXES[0]}")
+    if not images:
+        raise SourceError(
+            f"{name}: contains no images; expected files like 000000{IMAGE_SUFFIXES[0]}"
+        )
     times = next((note for note in ("times.txt", "times.csv") if note in notes), None)
     motion = notes.get("odometry.csv")
     return ImageSource(
         name,
-        sorted(pictures, key=lambda picture: natural_key(picture.name)),
+        sorted(images, key=lambda image: natural_key(image.name)),
         None if times is None else parse_times(notes[times], f"{name}: {times}"),
         frame_rate_hz,
         None if motion is None else parse_motion(motion, f"{name}: odometry.csv"),
     )
 
 
-def is_picture(name: str) -> bool:
-    """Tell whether a file is a picture, by its name; hidden files are none."""
+def is_image_name(name: str) -> bool:
+    """Return whether a file name is that of an image; hidden files do not count."""
     base = name.rpartition("/")[2]
     return base.lower().endswith(IMAGE_SUFFIXES) and not base.startswith(".")
 
 
 def natural_key(name: str) -> tuple[list[int | str], str]:
-    """Return what to sort names by so that numbers in them count as numbers.
+    """Return a sort key that compares the numbers in names as numbers.
 
     Example:
         >>> sorted(["10.jpg", "2.jpg", "a.jpg"], key=natural_key)
@@ -360,10 +365,10 @@ def natural_key(name: str) -> tuple[list[int | str], str]:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file.
+    """Read a UTF-8 text file.
 
     Raises:
-        SourceError: If it is not text.
+        SourceError: If it cannot be read, or is not UTF-8.
     """
     try:
         return to_text(path.read_bytes(), str(path))
@@ -372,12 +377,12 @@ def read_text(path: Path) -> str:
 
 
 def to_text(data: bytes, name: str) -> str:
-    """Decode UTF-8.
+    """Decode UTF-8 text.
 
     Raises:
-        SourceError: If it is not.
+        SourceError: If the bytes are not UTF-8.
     """
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise SourceError(f"{name}: is not a text file") from None
+        raise SourceError(f"{name}: is not a text file; expected UTF-8") from None

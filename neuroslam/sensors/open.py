@@ -1,4 +1,4 @@
-"""From what a user names on the command line to a source of frames."""
+"""Open a source of frames by the name that a user gives on the command line."""
 
 import csv
 import math
@@ -8,7 +8,13 @@ from pathlib import Path
 from neuroslam.errors import SourceError
 from neuroslam.sensors.camera import CameraSource
 from neuroslam.sensors.datasets import open_dataset
-from neuroslam.sensors.images import is_picture, open_folder, open_image_list, open_tar, read_text
+from neuroslam.sensors.images import (
+    is_image_name,
+    open_folder,
+    open_image_list,
+    open_tar,
+    read_text,
+)
 from neuroslam.sensors.rosbag import is_bag, open_bag
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
@@ -19,39 +25,39 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
-    "a video, a folder or tar of pictures, an image list or motion CSV, an .npz or .npy track, "
+    "a video, a folder or tar of images, an image list or motion CSV, an .npz or .npy track, "
     "a TUM, KITTI or EuRoC folder, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
     "motion as drive.avi+motion.csv"
 )
-_MADE = ("world:", "arena:", "camera:")
+_PREFIXES = ("world:", "arena:", "camera:")
 
 
 def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
-    """Open whatever ``spec`` names.
+    """Open the source that ``spec`` names.
 
     ==================================  ========================================================
     ``drive.avi``, ``.mp4``, ``.mkv``   video
-    ``frames/``, ``frames.tar``,        pictures, beside them times and motion if there are any
+    ``frames/``, ``frames.tar``,        images, with times and motion if there are any
     ``frames.tar.gz``                   (:mod:`neuroslam.sensors.images`)
     ``list.txt``, ``list.csv``          image list (:mod:`neuroslam.sensors.images`)
     ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
-    ``rat.npz`` with an arena in it     the same, and its walls (:mod:`neuroslam.worlds.rodent`)
-    TUM, KITTI or EuRoC folder          pictures and truth (:mod:`neuroslam.sensors.datasets`)
+    ``rat.npz`` with an arena in it     positions and walls (:mod:`neuroslam.worlds.rodent`)
+    TUM, KITTI or EuRoC folder          images and truth (:mod:`neuroslam.sensors.datasets`)
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
-    ``world:NAME``                      a world rendered on the fly
-    ``arena:NAME``, ``arena:rat.npz``   a walk sensed with noise (:mod:`neuroslam.worlds.senses`)
-    ``drive.avi+motion.csv``            two of these merged by time: a camera, and motion
+    ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)
+    ``arena:NAME``, ``arena:rat.npz``   walk with noisy senses (:mod:`neuroslam.worlds.senses`)
+    ``drive.avi+motion.csv``            two sources merged by time: a camera and motion
                                         (:mod:`neuroslam.sensors.streams`)
     ==================================  ========================================================
 
     Args:
         spec: A path, or ``kind:name``.
-        frame_rate_hz: Frames per second where the source has no times; ``None``: 20.
+        frame_rate_hz: Frames per second if the source has no times; ``None``: 20.
 
     Raises:
-        SourceError: If it is missing, of no known kind, or cannot be read; the line says why.
+        SourceError: If the source is missing, of no known kind, or cannot be read.
 
     Example:
         >>> open_source("nowhere.avi")  # doctest: +ELLIPSIS
@@ -61,13 +67,13 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     rate = DEFAULT_FRAME_RATE_HZ if frame_rate_hz is None else frame_rate_hz
     if not (math.isfinite(rate) and rate > 0):
         raise SourceError(f"{spec}: frame rate is {rate} Hz; expected a number above 0")
-    if spec == "":  # as a path it would be the working folder
-        raise SourceError(f"the source has an empty name; expected {_KINDS}")
+    if spec == "":  # as a path it would name the working folder
+        raise SourceError(f"the name of the source is empty; expected {_KINDS}")
     try:
         if parts := _parts(str(spec)):
             return Streams(*(open_source(part, frame_rate_hz) for part in parts))
         if isinstance(spec, str) and spec.startswith("world:"):
-            from neuroslam.worlds.world import open_world  # worlds build on readers of files
+            from neuroslam.worlds.world import open_world  # here: worlds import this package
 
             return open_world(spec)
         if isinstance(spec, str) and spec.startswith("arena:"):
@@ -99,7 +105,7 @@ def _bag_topics(spec: str) -> tuple[Path, dict[str, str]]:
 
 
 def absolute_spec(spec: str) -> str:
-    """Return what names the same source from any working folder.
+    """Return a name for the same source that is valid in any working folder.
 
     Example:
         >>> absolute_spec("world:town?laps=2"), absolute_spec("arena:square")
@@ -111,7 +117,7 @@ def absolute_spec(spec: str) -> str:
         name, mark, query = spec.removeprefix("arena:").partition("?")
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
         return f"arena:{name}{mark}{query}"
-    if spec.startswith(_MADE) or ("://" in spec and not Path(spec).exists()):
+    if spec.startswith(_PREFIXES) or ("://" in spec and not Path(spec).exists()):
         return spec
     path, topics = _bag_topics(spec)
     if topics and is_bag(path):
@@ -120,10 +126,10 @@ def absolute_spec(spec: str) -> str:
 
 
 def seeded_spec(spec: str, seed: int) -> str:
-    """Return what names the same source with a seed; a recording has none, and stays.
+    """Return a name for the same source with a seed; the name of a recording stays.
 
     Raises:
-        SourceError: If it has a seed.
+        SourceError: If the name has a seed already.
 
     Example:
         >>> seeded_spec("world:town?laps=2", 7), seeded_spec("drive.avi", 7)
@@ -131,27 +137,27 @@ def seeded_spec(spec: str, seed: int) -> str:
     """
     if parts := _parts(spec):
         return "+".join(seeded_spec(part, seed) for part in parts)
-    if not spec.startswith(_MADE):
+    if not spec.startswith(_PREFIXES):
         return spec
     name, _, query = spec.partition("?")
-    given = list(filter(None, query.split("&")))
-    if any(option.startswith("seed=") for option in given):
-        raise SourceError(f"{spec}: has a seed already; leave it or the number of seeds out")
-    return f"{name}?{'&'.join([*given, f'seed={seed}'])}"
+    options = list(filter(None, query.split("&")))
+    if any(option.startswith("seed=") for option in options):
+        raise SourceError(f"{spec}: has a seed already; leave out the seed or the number of seeds")
+    return f"{name}?{'&'.join([*options, f'seed={seed}'])}"
 
 
 def _parts(spec: str) -> tuple[str, str] | None:
-    """Split ``camera+motion``, where no file has that whole name and each part names something."""
+    """Split ``camera+motion``, unless a file has that whole name; each part must name a source."""
     if "+" not in spec or Path(spec).exists():
         return None
     splits = [(spec[:at], spec[at + 1 :]) for at, letter in enumerate(spec) if letter == "+"]
     for parts in splits:
-        if all(part.startswith(_MADE) or _exists(part) for part in parts):
+        if all(part.startswith(_PREFIXES) or _exists(part) for part in parts):
             return parts
     for parts in splits:
         for part, other in (parts, parts[::-1]):
             if _exists(part):
-                raise SourceError(f"{spec}: {part} is there, {other!r} is not; expected {_KINDS}")
+                raise SourceError(f"{spec}: {part} exists, {other!r} does not; expected {_KINDS}")
     return None
 
 
@@ -171,26 +177,26 @@ def _opener(path: Path) -> Callable[[Path, float], Source]:
         return _open_table
     if name.endswith((".npz", ".npy")):
         return _open_positions
-    what = "is a single picture" if is_picture(name) else "is of no known kind"
+    what = "is a single image" if is_image_name(name) else "is of no known kind"
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
 
 
 def _open_folder(path: Path, frame_rate_hz: float) -> Source:
-    """Open a dataset if it is laid out like one, else the pictures in it."""
+    """Open a folder as a dataset if it has the layout of one, else as a folder of images."""
     return open_dataset(path, frame_rate_hz) or open_folder(path, frame_rate_hz)
 
 
 def _open_table(path: Path, frame_rate_hz: float) -> Source:
-    """Open a text file: an image list if one of its first lines names a picture, else motion."""
+    """Open a text file: an image list if one of its first lines names an image, else motion."""
     text = read_text(path)
     for row in csv.reader(text.splitlines()[:10]):
-        if any(is_picture(word) for field in row for word in field.split()):
+        if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
 
 
 def _open_positions(path: Path, frame_rate_hz: float) -> Source:
-    """Open a track, with its walls if it has an arena."""
+    """Open a track, and its walls if it has an arena."""
     from neuroslam.worlds.rodent import ARENA_KEYS, read_walk
     from neuroslam.worlds.senses import ArenaSource
 

@@ -1,14 +1,14 @@
-"""Bags of ROS 1 and ROS 2: a camera, wheel odometry, a laser scanner; needs the extra ``rosbag``.
+"""ROS 1 and ROS 2 bags: camera, wheel odometry, laser scanner; needs the extra ``rosbag``.
 
 ``drive.bag``, a ``.db3`` or ``.mcap`` file, or a folder with ``metadata.yaml``. The first topic of
-each kind is taken, or the one named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``.
+each kind is read, or the one named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``.
 """
 
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.sensors.images import decode_grey, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.sensors.streams import Streams
+from neuroslam.sensors.tracks import time_text
 from neuroslam.types import Frame, Velocity
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
@@ -27,7 +28,7 @@ KINDS = {
     "scan": ("sensor_msgs/msg/LaserScan",),
 }
 N_RANGES = 360
-"""Bearings that a scan is brought to, evenly over the full turn."""
+"""Number of bearings to which a scan is resampled, evenly over the full turn."""
 
 _GREY = {
     "mono8": (np.uint8, 1, None),
@@ -47,11 +48,11 @@ _GREY = {
     "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
 }
-"""Encoding -> type and number of channels of a pixel, and how it becomes grey."""
+"""For each encoding: type and number of channels of a pixel, and its conversion to grey."""
 
 
 def is_bag(path: Path) -> bool:
-    """Tell a bag by its name, or a folder by its ``metadata.yaml``."""
+    """Return whether a path is a bag: by its suffix, or a folder by its ``metadata.yaml``."""
     return path.name.lower().endswith(BAG_SUFFIXES) or (path / "metadata.yaml").is_file()
 
 
@@ -60,47 +61,50 @@ def open_bag(path: Path, topics: dict[str, str] | None = None) -> Source:
 
     Args:
         path: File or folder.
-        topics: Topic of each of ``KINDS`` that is not the first of its kind.
+        topics: Topic by kind (see ``KINDS``); by default the first of each kind.
 
     Raises:
-        SourceError: If ``rosbags`` is not installed, the bag is damaged, or has no such topic.
+        SourceError: If ``rosbags`` is not installed, the bag is damaged, or it lacks a topic.
     """
     topics = topics or {}
     if unknown := set(topics) - set(KINDS):
         raise SourceError(
-            f"{path}: unknown option {min(unknown)!r}; there are {', '.join(KINDS)}"
+            f"{path}: unknown option {min(unknown)!r}; expected one of {', '.join(KINDS)}"
             f"{did_you_mean(min(unknown), KINDS)}"
         )
     with _opened(path) as reader:
-        there = {c.topic: c.msgtype for c in reader.connections}
+        available = {c.topic: c.msgtype for c in reader.connections}
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
-    chosen = {kind: _choose(path, kind, topics.get(kind), there) for kind in KINDS}
+    chosen = {kind: _choose(path, kind, topics.get(kind), available) for kind in KINDS}
     if chosen["image"] is None and chosen["odometry"] is None:
         raise SourceError(
-            f"{path}: holds neither pictures nor odometry; its topics are {_listed(there)}"
+            f"{path}: contains neither images nor odometry; its topics are {_listed(available)}"
         )
-    motion = camera = None
+    motion: BagMotion | None = None
+    camera: BagCamera | None = None
     if (topic := chosen["odometry"]) is not None:
         motion = BagMotion(path, topic, chosen["scan"], counts[topic])
     if (topic := chosen["image"]) is not None:
         camera = BagCamera(path, topic, counts[topic])
-    return Streams(camera, motion) if camera and motion else camera or motion
+    if camera is not None and motion is not None:
+        return Streams(camera, motion)
+    return cast(Source, camera or motion)  # one is there, as checked above
 
 
-def _choose(path: Path, kind: str, wanted: str | None, there: dict[str, str]) -> str | None:
-    fitting = sorted(topic for topic, msgtype in there.items() if msgtype in KINDS[kind])
+def _choose(path: Path, kind: str, wanted: str | None, available: dict[str, str]) -> str | None:
+    fitting = sorted(topic for topic, msgtype in available.items() if msgtype in KINDS[kind])
     if wanted is None:
         return fitting[0] if fitting else None
     if wanted not in fitting:
-        what = "is not in it" if wanted not in there else f"has {there[wanted]}"
+        problem = f"has {available[wanted]}" if wanted in available else "is not in the bag"
         raise SourceError(
-            f"{path}: topic {wanted!r} {what}; for {kind} there are {', '.join(fitting) or 'none'}"
+            f"{path}: topic {wanted!r} {problem}; topics for {kind}: {', '.join(fitting) or 'none'}"
         )
     return wanted
 
 
-def _listed(there: dict[str, str]) -> str:
-    return ", ".join(f"{topic} ({msgtype})" for topic, msgtype in sorted(there.items())) or "none"
+def _listed(topics: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({msgtype})" for topic, msgtype in sorted(topics.items())) or "none"
 
 
 @contextmanager
@@ -110,19 +114,21 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise SourceError(
-            f'{path}: is a ROS bag; to read it: pip install "neuroslam[rosbag]"'
+            f'{path}: is a ROS bag; to read it, pip install "neuroslam[rosbag]"'
         ) from None
     try:
         kinds = get_typestore(Stores.ROS2_HUMBLE if path.suffix != ".bag" else Stores.ROS1_NOETIC)
         with AnyReader([path], default_typestore=kinds) as reader:
             yield reader
     except (AnyReaderError, OSError, KeyError, ValueError, AssertionError) as error:
-        said = (str(error) or type(error).__name__).splitlines()[0]
-        raise SourceError(f"{path}: is not a whole ROS bag ({said})") from None
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise SourceError(
+            f"{path}: is damaged or incomplete ({reason}); expected a ROS bag"
+        ) from None
 
 
 class _BagTopic(Source):
-    """Messages of some topics, in order of time, as frames; what cannot be used is left out."""
+    """Messages of some topics, in order of time; each message of the first topic is a frame."""
 
     def __init__(self, path: Path, topics: tuple[str, ...], n_messages: int) -> None:
         self.path, self.topics = path, topics
@@ -144,39 +150,39 @@ class _BagTopic(Source):
                 message = reader.deserialize(data, connection.msgtype)
                 time_s = _time_s(message, received_ns)
                 if connection.topic != self.topics[0]:
-                    self._also(message)
+                    self._update(message)
                     continue
                 try:
                     frame = self._frame(index, time_s, message)
                     if not time_s > last_s:
                         raise BadFrame(
-                            f"{self.name}: frame {index}: its time {time_s:.6f} s is not after "
-                            f"{last_s:.6f} s; times must rise"
+                            f"{self.name}: frame {index}: its time {time_text(time_s)} is not "
+                            f"after {time_text(last_s)}; times must rise"
                         )
                     last_s = time_s
-                except BadFrame as fault:
+                except BadFrame as error:
                     if index >= start:
                         if on_bad_frame is None:
                             raise
-                        on_bad_frame(fault)
+                        on_bad_frame(error)
                 else:
                     if index >= start:
                         yield frame
                 index += 1
 
     def _begin(self) -> None:
-        """Forget what an earlier reading has left."""
+        """Reset the state of an earlier reading."""
 
     @abstractmethod
     def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
         """Make a frame of a message of the first topic."""
 
-    def _also(self, message: Any) -> None:  # noqa: ANN401
-        """Take in a message of another topic than the first."""
+    def _update(self, message: Any) -> None:  # noqa: ANN401
+        """Process a message of another topic than the first."""
 
 
 class BagCamera(_BagTopic):
-    """The pictures of a topic, in grey."""
+    """The images of one topic, in grey."""
 
     def __init__(self, path: Path, topic: str, n_messages: int) -> None:
         super().__init__(path, (topic,), n_messages)
@@ -193,7 +199,7 @@ class BagCamera(_BagTopic):
 
 
 class BagMotion(_BagTopic):
-    """The measured motion of a topic, and the ranges of another that were last scanned."""
+    """The measured motion of one topic, and the latest scan of another."""
 
     def __init__(self, path: Path, topic: str, scan: str | None, n_messages: int) -> None:
         super().__init__(path, (topic,) if scan is None else (topic, scan), n_messages)
@@ -202,7 +208,7 @@ class BagMotion(_BagTopic):
     def _begin(self) -> None:
         self.ranges: np.ndarray | None = None
 
-    def _also(self, message: Any) -> None:  # noqa: ANN401
+    def _update(self, message: Any) -> None:  # noqa: ANN401
         self.ranges = full_turn(message.ranges, message.angle_min, message.angle_increment,
                                 message.range_min, message.range_max)  # fmt: skip
 
@@ -210,25 +216,27 @@ class BagMotion(_BagTopic):
         twist = message.twist.twist
         v, w = float(twist.linear.x), float(twist.angular.z)
         if not (np.isfinite(v) and np.isfinite(w)):
-            raise BadFrame(f"{self.name}: frame {index}: v = {v}, w = {w}; expected finite numbers")
+            raise BadFrame(
+                f"{self.name}: frame {index}: v = {v} m/s, w = {w} rad/s; expected finite numbers"
+            )
         return Frame(index, time_s, velocity=Velocity(v, w), ranges=self.ranges)
 
 
 def full_turn(
-    ranges: np.ndarray, first_rad: float, step_rad: float, least_m: float, most_m: float
+    ranges: np.ndarray, first_rad: float, step_rad: float, min_m: float, max_m: float
 ) -> np.ndarray:
-    """Bring the rays of a scanner to bearings evenly over the full turn.
+    """Resample a scan to bearings evenly over the full turn.
 
     Args:
         ranges: Distances in metres, ``(n,)``.
-        first_rad: Bearing of the first, to the left positive.
-        step_rad: From one to the next.
-        least_m: Nearer is nothing.
-        most_m: Farther is nothing.
+        first_rad: Bearing of the first beam, positive to the left.
+        step_rad: Angle from beam to beam.
+        min_m: Shorter distances are invalid.
+        max_m: Longer distances are invalid.
 
     Returns:
-        Distances at ``N_RANGES`` bearings, counter-clockwise from straight ahead: that of the ray
-        nearest in bearing, ``inf`` where there is none within a step, or it met nothing.
+        Distances at ``N_RANGES`` bearings, counter-clockwise from straight ahead: that of the beam
+        nearest in bearing; ``inf`` if no beam is within one step, or its distance is invalid.
 
     Example:
         >>> turn = full_turn(np.array([1.0, 2.0, 3.0]), -np.pi / 2, np.pi / 2, 0.1, 10.0)
@@ -236,13 +244,13 @@ def full_turn(
         [1.0, 2.0, 3.0, inf]
     """
     distances = np.asarray(ranges, np.float64)
-    distances = np.where((distances >= least_m) & (distances <= most_m), distances, np.inf)
+    distances = np.where((distances >= min_m) & (distances <= max_m), distances, np.inf)
     bearings = np.arange(N_RANGES) * (TWO_PI / N_RANGES)
     middle = first_rad + 0.5 * step_rad * (len(distances) - 1)
-    apart = wrap_angles(bearings - middle) + (middle - first_rad)
-    ray = np.rint(apart / step_rad).astype(np.int64)
-    held = (ray >= 0) & (ray < len(distances))
-    return np.where(held, distances[ray.clip(0, len(distances) - 1)], np.inf)
+    offset = wrap_angles(bearings - middle) + (middle - first_rad)
+    beam = np.rint(offset / step_rad).astype(np.int64)
+    covered = (beam >= 0) & (beam < len(distances))
+    return np.where(covered, distances[beam.clip(0, len(distances) - 1)], np.inf)
 
 
 def _time_s(message: Any, received_ns: int) -> float:  # noqa: ANN401
@@ -255,7 +263,7 @@ def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
     if hasattr(message, "format"):
         image = decode_grey(bytes(message.data))
         if image is None:
-            raise BadFrame(f"{name}: frame {index}: its picture is corrupt ({message.format})")
+            raise BadFrame(f"{name}: frame {index}: its {message.format} image is corrupt")
         return image
     if message.encoding not in _GREY:
         raise BadFrame(
@@ -269,7 +277,7 @@ def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
     if message.step < used or len(data) < h * message.step:
         raise BadFrame(
             f"{name}: frame {index}: {len(data)} bytes in rows of {message.step} for {w} x {h} px "
-            f"{message.encoding}; it is damaged"
+            f"{message.encoding}; the message is damaged"
         )
     rows = np.ascontiguousarray(data[: h * message.step].reshape(h, message.step)[:, :used])
     pixels = rows.view(dtype).reshape((h, w) if channels == 1 else (h, w, channels))

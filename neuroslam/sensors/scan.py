@@ -1,8 +1,8 @@
-"""Walls in a lidar's scan: the feet of the perpendiculars, as boundary cells need them.
+"""Detects the walls in a lidar scan: the feet of the perpendiculars, the input of boundary cells.
 
-A window slides over the beams and is fitted with a line; where the foot of the perpendicular on
-that line lies among the window's own points there may be a wall, straight or curved. The points
-that agree with it are gathered and fitted once more, with a parabola if they bend.
+A line is fitted to a window that slides over the beams. If the foot of the perpendicular on that
+line lies among the window's points, there may be a wall, straight or curved. The inliers of the
+wall are collected and fitted once more, with a parabola if they are curved.
 """
 
 import math
@@ -12,27 +12,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neuroslam.errors import BadFrame
-from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.sensors.frames import checked_array
 
-_WINDOW_M = 0.06  # half the window: in it a corner of 90 degrees shows, and a pillar is still flat
-_WALL_M = 0.25  # half of the most that is fitted of one wall
-_FEWEST = 5  # points of a wall
+_WINDOW_M = 0.06  # half the window: shows a corner of 90 degrees, but not the curve of a pillar
+_WALL_M = 0.25  # half the longest stretch of a wall that is fitted
+_MIN_POINTS = 5  # of a wall
 _OUTLIER = 3.0  # tolerances
-_BENT, _SHARP = 2.5, 3.0  # standard deviations that tell a curve, a corner from a line
-_ALIKE_RAD = 0.5  # walls that differ by less and share points are one
+_BENT, _SHARP = 2.5, 3.0  # standard deviations that distinguish a curve, a corner from a line
+_SAME_RAD = 0.5  # walls that share points and differ by less in bearing are one
 _ROUNDS = 4
 
 
 class _Points(NamedTuple):
-    """The scan unrolled by a third of a turn at both ends, so that no window has to wrap.
+    """The scan extended by a third of a turn at both ends, so that no window has to wrap.
 
     Attributes:
-        xy: Metres, ahead is x, ``(2, m)``; zero where the beam found nothing.
-        seen: Whether it found something, ``(m,)``.
-        first: First beam of the surface that each beam is on, ``(m,)``.
-        last: Its last one.
-        pad: Beams before the first of the scan.
+        xy: Points in metres, x ahead, ``(2, m)``; zero where the beam hits nothing.
+        seen: Whether the beam hits a surface, ``(m,)``.
+        first: First beam on the same surface as each beam, ``(m,)``.
+        last: Last beam on the same surface, ``(m,)``.
+        pad: Number of beams before the first of the scan.
         step: Angle from beam to beam.
     """
 
@@ -45,7 +45,7 @@ class _Points(NamedTuple):
 
 
 class _Wall(NamedTuple):
-    """Distance and bearing of the foot, and the unrolled beams that are on the wall."""
+    """Distance and bearing of the foot, and the first and last beam on the wall."""
 
     distance_m: float
     bearing_rad: float
@@ -54,7 +54,7 @@ class _Wall(NamedTuple):
 
 
 class _Curve(NamedTuple):
-    """Coefficients of a fitted wall in the frame of its foot, RMS misfit, degrees of freedom."""
+    """Coefficients of a fitted wall in the frame of its foot, RMS residual, degrees of freedom."""
 
     q: tuple[float, float, float]
     rms: float
@@ -62,26 +62,26 @@ class _Curve(NamedTuple):
 
 
 def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) -> np.ndarray:
-    """Find the walls in a scan: the feet of the perpendiculars on them.
+    """Detect the walls in a scan: the feet of the perpendiculars on them.
 
-    A corner that stands out is the nearest point of its surroundings too, but its sides slope on
-    from it, and it is not taken; nor is a wall whose foot lies beyond what is seen of it.
+    A convex corner is a local minimum of the distance as well, but no wall: it is rejected, as is a
+    wall whose foot lies outside its visible part.
 
     Args:
         ranges: Metres, ``(n,)``, at bearings evenly over the full turn, counter-clockwise from
-            straight ahead; ``inf`` where nothing is in reach.
-        reach_m: Only walls so near. Let the lidar reach farther, for a wall is known by its points
-            on both sides of the foot.
-        tolerance_m: Standard deviation of the ranges' noise. What is bent by less than that may
-            pass for straight.
+            straight ahead; ``inf`` where nothing is in range.
+        reach_m: Largest distance of a wall. The range of the lidar should be larger, as a wall is
+            detected by its points on both sides of the foot.
+        tolerance_m: Standard deviation of the noise of the ranges. A curve that deviates less from
+            a line may be fitted as straight.
 
     Returns:
         Distance in metres and bearing relative to the heading in [-pi, pi), ``(m, 2)``, nearest
         first.
 
     Raises:
-        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or holds NaN or negative
-            ranges; if the reach or the tolerance is not above zero.
+        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or contains NaN or negative
+            ranges; if the reach or the tolerance is not positive.
 
     Example:
         >>> beams = 2 * np.pi * np.arange(180) / 180
@@ -97,73 +97,73 @@ def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) 
     found: list[_Wall] = []
     if scan.min() > reach_m + _OUTLIER * tolerance_m:
         return np.empty((0, 2))
-    points = _unrolled(scan, tolerance_m)
-    misfit, distance, bearing = _slide(points, scan, reach_m, tolerance_m)
+    points = _extended(scan, tolerance_m)
+    residual, distance, bearing = _fit_windows(points, scan, reach_m, tolerance_m)
     n, pad = len(scan), points.pad
-    while misfit[seed := int(misfit.argmin())] < np.inf:
-        wall = _gather(points, pad + seed, distance[seed], bearing[seed], tolerance_m)
+    while residual[seed := int(residual.argmin())] < np.inf:
+        wall = _grow(points, pad + seed, distance[seed], bearing[seed], tolerance_m)
         if wall is None or wall.distance_m > reach_m:
-            spent = np.arange(seed - 1, seed + 2)
+            used = np.arange(seed - 1, seed + 2)
         else:
-            spent = np.arange(wall.first - pad, wall.last + 1 - pad)
+            used = np.arange(wall.first - pad, wall.last + 1 - pad)
             if not any(_same(wall, other, n) for other in found):
                 found.append(wall)
-        misfit[spent % n] = np.inf
+        residual[used % n] = np.inf
     return np.array(sorted(wall[:2] for wall in found)).reshape(-1, 2)
 
 
 def checked_ranges(ranges: object) -> np.ndarray:
-    """Return the ranges of a scan, if a lidar can have measured them.
+    """Check the ranges of a scan.
 
     Args:
-        ranges: Metres, ``(n,)``; ``inf`` where nothing is in reach.
+        ranges: Metres, ``(n,)``; ``inf`` where nothing is in range.
 
     Returns:
-        The same, ``float64``.
+        The ranges as ``float64``.
 
     Raises:
-        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or holds NaN, negative ranges
-            or no numbers at all.
+        BadFrame: If the scan is not ``(n,)`` with at least 8 beams, or contains NaN, negative
+            ranges or values that are no numbers.
 
     Example:
         >>> checked_ranges([1.0, 2.0])
         Traceback (most recent call last):
         neuroslam.errors.BadFrame: scan: ranges have shape (2,); expected (n,), at least 8 beams
     """
-    scan = checked_array(ranges, "scan: ranges", (None,), "metres of at least 8 beams")
+    scan = checked_array(ranges, "scan: ranges", (None,), "metres, at least 8 beams")
     if len(scan) < 8:
         raise BadFrame(f"scan: ranges have shape {scan.shape}; expected (n,), at least 8 beams")
     if not scan.min() >= 0.0:  # NaN too
         at = int(np.flatnonzero(~(scan >= 0.0))[0])
         raise BadFrame(
-            f"scan: beam {at} measures {scan[at]:g} m; expected metres, at least 0, or inf where "
-            "nothing is in reach"
+            f"scan: beam {at} measures {scan[at]} m; expected at least 0 m, or inf where nothing "
+            "is in range"
         )
     return scan
 
 
-def _unrolled(scan: np.ndarray, tolerance_m: float) -> _Points:
+def _extended(scan: np.ndarray, tolerance_m: float) -> _Points:
     n = len(scan)
     step, pad = TWO_PI / n, n // 3
     seen = scan < np.inf
     r = np.where(seen, scan, 0.0)
     before = np.concatenate([r[-1:], r[:-1]])
-    # A wall seen at a slant of up to 75 degrees changes by less than this from beam to beam.
-    parted = np.abs(r - before) > 5.0 * tolerance_m + 4.0 * step * np.minimum(r, before)
-    parted |= ~(seen & np.roll(seen, 1))
+    # The range of one wall, at up to 75 degrees of incidence, changes by less from beam to beam.
+    starts = np.abs(r - before) > 5.0 * tolerance_m + 4.0 * step * np.minimum(r, before)
+    starts |= ~(seen & np.roll(seen, 1))
     order = np.arange(-pad, n + pad) % n
-    at, parted = np.arange(len(order)), parted[order]
-    first = np.maximum.accumulate(np.where(parted, at, 0))
-    next_one = np.minimum.accumulate(np.where(parted, at, len(order))[::-1])[::-1]
+    at, starts = np.arange(len(order)), starts[order]
+    first = np.maximum.accumulate(np.where(starts, at, 0))
+    next_start = np.minimum.accumulate(np.where(starts, at, len(order))[::-1])[::-1]
     beam = step * np.arange(n)
     xy = np.empty((2, n))
     np.multiply(r, np.cos(beam), out=xy[0])
     np.multiply(r, np.sin(beam), out=xy[1])
-    last = np.append(next_one[1:], len(order)) - 1
+    last = np.append(next_start[1:], len(order)) - 1
     return _Points(xy[:, order], seen[order], first, last, pad, step)
 
 
-def _slide(
+def _fit_windows(
     points: _Points, scan: np.ndarray, reach_m: float, tolerance_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     r"""Fit a line to a window about each beam, by its moments: :math:`p \cdot n(\alpha) = d`.
@@ -172,8 +172,8 @@ def _slide(
     \sqrt{(c_{xx} - c_{yy})^2 + 4 c_{xy}^2})`.
 
     Returns:
-        RMS distance of the window's points from the line, ``inf`` where there is no wall; its
-        distance and bearing; each ``(n,)``.
+        For each beam, ``(n,)``: RMS distance of the window's points from the line, ``inf`` without
+        a wall; distance of the wall; its bearing.
     """
     n, step = len(scan), points.step
     here = np.flatnonzero(scan <= np.hypot(reach_m, _WINDOW_M) + _OUTLIER * tolerance_m)
@@ -196,43 +196,45 @@ def _slide(
     free = np.maximum(count - 2.0, 1.0)
     rms = np.sqrt(np.maximum(least, 0.0) * count / free)
     off = np.abs(wrap_angles(bearing - step * (0.5 * (low + high) - points.pad)))
-    good = (count >= _FEWEST) & (rms <= _allowed(tolerance_m, free))
-    good &= (np.abs(d) <= reach_m + 2.0 * tolerance_m) & (off <= step * (0.5 * (high - low) + 0.5))
-    misfit, distances, bearings = np.full(n, np.inf), np.zeros(n), np.zeros(n)
-    misfit[here], distances[here], bearings[here] = np.where(good, rms, np.inf), np.abs(d), bearing
-    return misfit, distances, bearings
+    valid = (count >= _MIN_POINTS) & (rms <= _max_rms(tolerance_m, free))
+    valid &= (np.abs(d) <= reach_m + 2.0 * tolerance_m) & (off <= step * (0.5 * (high - low) + 0.5))
+    residuals, distances, bearings = np.full(n, np.inf), np.zeros(n), np.zeros(n)
+    residuals[here] = np.where(valid, rms, np.inf)
+    distances[here], bearings[here] = np.abs(d), bearing
+    return residuals, distances, bearings
 
 
-def _gather(
+def _grow(
     points: _Points, seed: int, distance_m: float, bearing_rad: float, tolerance_m: float
 ) -> _Wall | None:
-    r"""Gather the points about a beam that are on one wall, and fit them.
+    r"""Collect the inliers of the wall at a beam, and fit them.
 
     In the frame of the foot, u along the wall and v beyond it, the wall is
-    :math:`v = q_0 + q_1 u + q_2 u^2`, with :math:`q_2` only if it is significant. Points count for
-    :math:`1 - (e / 3\sigma)^2`. A corner, :math:`v = q_0 + q_1 u + q_2 |u|` with :math:`q_2 > 0`,
-    is no wall.
+    :math:`v = q_0 + q_1 u + q_2 u^2`, with :math:`q_2` only if it is significant. The weight of a
+    point with residual :math:`e` is :math:`1 - (e / 3\sigma)^2`. A corner,
+    :math:`v = q_0 + q_1 u + q_2 |u|` with :math:`q_2 > 0`, is no wall: the result is ``None``.
     """
     reach = (len(points.seen) - 2 * points.pad) // 3
     start = max(int(points.first[seed]), seed - reach)
     x, y = points.xy[:, start : min(int(points.last[seed]), seed + reach) + 1]
-    bend, limit, ends = 0.0, _OUTLIER * tolerance_m, (0, 0)
+    curvature, limit, ends = 0.0, _OUTLIER * tolerance_m, (0, 0)
+    curve, corner, inside, low, high = None, False, False, 0, 0
     for _ in range(_ROUNDS):
-        c, s = math.cos(bearing_rad), math.sin(bearing_rad)
-        u, v = c * y - s * x, c * x + s * y - distance_m
-        share = 1.0 - ((v - bend * u * u) / limit) ** 2
-        stray = np.flatnonzero((share < 0.0) | (np.abs(u) > _WALL_M))
-        k = int(stray.searchsorted(seed - start))
-        low = int(stray[k - 1]) + 1 if k else 0
-        high = int(stray[k]) if k < len(stray) else len(u)
-        if high - low < _FEWEST or not low <= seed - start < high:
+        ahead, u = rotate(x, y, -bearing_rad)
+        v = ahead - distance_m
+        weight = 1.0 - ((v - curvature * u * u) / limit) ** 2
+        outliers = np.flatnonzero((weight < 0.0) | (np.abs(u) > _WALL_M))
+        k = int(outliers.searchsorted(seed - start))
+        low = int(outliers[k - 1]) + 1 if k else 0
+        high = int(outliers[k]) if k < len(outliers) else len(u)
+        if high - low < _MIN_POINTS or not low <= seed - start < high:
             return None
         u, v = u[low:high], v[low:high]
         rows = np.empty((5, high - low))
         rows[0], rows[1], rows[4] = 1.0, u, v
         np.multiply(u, u, out=rows[2])
         np.abs(u, out=rows[3])
-        curve, corner = _fit(((rows * share[low:high]) @ rows.T).tolist(), high - low, tolerance_m)
+        curve, corner = _fit(((rows * weight[low:high]) @ rows.T).tolist(), high - low, tolerance_m)
         if curve is None:
             return None
         q0, q1, q2 = curve.q
@@ -241,25 +243,24 @@ def _gather(
             return None
         along, off = foot
         pitch = off * points.step
-        inside = u[0] - pitch <= along <= u[-1] + pitch
+        inside = bool(u[0] - pitch <= along <= u[-1] + pitch)
         distance_m, bearing_rad = math.hypot(along, off), bearing_rad + math.atan2(along, off)
-        bend = q2
+        curvature = q2
         if ends == (low, high):
             break
         ends = low, high
-    if corner or not inside or curve.rms > _allowed(tolerance_m, curve.free):
+    if curve is None or corner or not inside or curve.rms > _max_rms(tolerance_m, curve.free):
         return None
-    bearing_rad = (bearing_rad + math.pi) % TWO_PI - math.pi
-    return _Wall(distance_m, bearing_rad, start + low, start + high - 1)
+    return _Wall(distance_m, wrap_angle(bearing_rad), start + low, start + high - 1)
 
 
 def _fit(table: list[list[float]], count: int, tolerance_m: float) -> tuple[_Curve | None, bool]:
     """Fit line, parabola and corner by their moments; return the wall, and whether it is a corner.
 
     Args:
-        table: Weighted products of 1, u, u^2, |u| and v, ``(5, 5)``.
-        count: Points in it.
-        tolerance_m: Their noise.
+        table: Weighted sums of the products of 1, u, u^2, |u| and v, ``(5, 5)``.
+        count: Number of points.
+        tolerance_m: Standard deviation of their noise.
     """
     (s, su, suu, sa, sv), (_, _, suuu, sua, suv), (_, _, s4, _, suuv), (*_, saa, sav), _ = table
     svv = table[4][4]
@@ -268,13 +269,13 @@ def _fit(table: list[list[float]], count: int, tolerance_m: float) -> tuple[_Cur
         return None, False
     q0, q1 = (suu * sv - su * suv) / det, (s * suv - su * sv) / det
     curve = _curve((q0, q1, 0.0), svv - q0 * sv - q1 * suv, count - 2)
-    if count < _FEWEST + 3:
+    if count < _MIN_POINTS + 3:
         return curve, False
     bent, q2_std = _third(det, (s, su, suu), (suu, suuu, s4), (sv, suv, suuv), svv, count)
     kinked, kink_std = _third(det, (s, su, suu), (sa, sua, saa), (sv, suv, sav), svv, count)
-    noise_m = max(kinked.rms, 0.1 * tolerance_m)  # less than that is not worth a corner
+    noise_m = max(kinked.rms, 0.1 * tolerance_m)  # a lower bound, else rounding makes corners
     sharp = kinked.q[2] > _SHARP * kink_std * noise_m and kinked.rms < bent.rms
-    # Bent only if the noise does not explain it: else a wall would bend round the next corner.
+    # Curved only if noise does not explain it; else a wall would bend around the next corner.
     return bent if abs(bent.q[2]) > _BENT * q2_std * tolerance_m else curve, sharp
 
 
@@ -286,12 +287,12 @@ def _third(
     svv: float,
     count: int,
 ) -> tuple[_Curve, float]:
-    """Fit 1, u and a third column; return its coefficient's deviation too, for noise of 1 m."""
+    """Fit 1, u and a third column; return also its coefficient's deviation for noise of 1 m."""
     s, su, suu = line
     c0, c1, cc = column
     v0, v1, vc = target
     a0, a1 = (suu * c0 - su * c1) / det, (s * c1 - su * c0) / det
-    own = max(cc - a0 * c0 - a1 * c1, 1e-9 * cc)  # what it has that no line has
+    own = max(cc - a0 * c0 - a1 * c1, 1e-9 * cc)  # squared norm of its part that is no line
     q2 = (vc - a0 * v0 - a1 * v1) / own
     q0 = (suu * v0 - su * v1) / det - a0 * q2
     q1 = (s * v1 - su * v0) / det - a1 * q2
@@ -304,7 +305,7 @@ def _curve(q: tuple[float, float, float], squares: float, free: int) -> _Curve:
 
 
 def _foot(q0: float, q1: float, q2: float) -> tuple[float, float] | None:
-    """Find the nearest point of a parabola, by Newton's rule; ``None`` if it is no nearest one."""
+    """Find the nearest point of a parabola by Newton's method; ``None`` if it is no minimum."""
     along = 0.0
     for _ in range(3):
         off, slope = q0 + (q1 + q2 * along) * along, q1 + 2.0 * q2 * along
@@ -315,15 +316,20 @@ def _foot(q0: float, q1: float, q2: float) -> tuple[float, float] | None:
     return along, q0 + (q1 + q2 * along) * along
 
 
-def _allowed(tolerance_m: float, free: np.ndarray) -> np.ndarray:
-    """RMS misfit that a wall exceeds in one case of a hundred, by so many degrees of freedom."""
+def _max_rms(tolerance_m: float, free: float | np.ndarray) -> float | np.ndarray:
+    """Return the RMS residual that a wall exceeds with probability 1 %.
+
+    Args:
+        tolerance_m: Standard deviation of the noise.
+        free: Degrees of freedom of the fit.
+    """
     return tolerance_m * (1.0 + 2.5 / np.sqrt(2.0 * free))
 
 
 def _same(wall: _Wall, other: _Wall, n: int) -> bool:
-    """Tell whether two walls face alike and the foot of one is on the other's points."""
-    turn = (wall.bearing_rad - other.bearing_rad + math.pi) % TWO_PI - math.pi
-    return abs(turn) < _ALIKE_RAD and any(
+    """Return whether two walls have a similar bearing and the foot of one is on the other."""
+    turn = wrap_angle(wall.bearing_rad - other.bearing_rad)
+    return abs(turn) < _SAME_RAD and any(
         (a.bearing_rad / TWO_PI * n + n // 3 - b.first + 0.5) % n <= b.last - b.first + 1
         for a, b in ((wall, other), (other, wall))
     )

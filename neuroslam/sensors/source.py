@@ -1,4 +1,4 @@
-"""What every source of frames offers: a name, a length where it is known, and the frames."""
+"""Interface of all sources of frames."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -12,14 +12,15 @@ OnBadFrame = Callable[[BadFrame], object] | None
 class Source(ABC):
     """A stream of frames.
 
-    Opening one is cheap and finds the user's mistakes; frames are made only when asked for.
+    Opening a source is cheap and finds the user's mistakes; frames are made only on demand.
 
     Attributes:
-        name: How the source is called in reports.
-        n_frames: How many frames it has, or ``None`` if only reading it to the end would tell.
-        frame_rate_hz: Frames per second, or ``None`` if unknown.
-        live: Whether it shows what is there now, so that its frames cannot be read a second time.
-        unused: What of it is in no frame, and why, a line each; known as far as it was read last.
+        name: Name of the source in reports.
+        n_frames: Number of frames; ``None`` if unknown before the source is read to its end.
+        frame_rate_hz: Frames per second; ``None`` if unknown.
+        live: Whether the source is live: its frames cannot be read a second time.
+        unused: Data that is in no frame, and why, one line each; complete once the source was
+            read to its end.
     """
 
     name: str
@@ -32,17 +33,17 @@ class Source(ABC):
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
-        """Yield the frames ``start <= index < stop``; the same ones whatever ``start`` is.
+        """Yield the frames ``start <= index < stop``; a frame does not depend on ``start``.
 
         Args:
-            start: Number, in the source, of the first frame delivered.
-            stop: Number at which to stop, or ``None`` for all.
-            on_bad_frame: Called with the fault of each frame that cannot be used, which is then
-                left out (a list's ``append`` collects them); ``None``: the fault is raised.
+            start: Index of the first frame.
+            stop: Index after the last frame; ``None`` for all.
+            on_bad_frame: Called with the error of each unusable frame, which is then skipped (a
+                list's ``append`` collects them); ``None``: the error is raised.
 
         Raises:
-            BadFrame: If a frame cannot be used and ``on_bad_frame`` is ``None``.
-            SourceError: If the source cannot be read on.
+            BadFrame: If a frame is unusable and ``on_bad_frame`` is ``None``.
+            SourceError: If the source cannot be read any further.
         """
 
     def __iter__(self) -> Iterator[Frame]:
@@ -50,16 +51,16 @@ class Source(ABC):
 
 
 class IndexedSource(Source):
-    """A source that can make any of its frames at once, knowing its number."""
+    """A source with random access to its frames."""
 
-    n_frames: int
+    n_frames: int  # pyright: ignore[reportIncompatibleVariableOverride] - known beforehand
 
     @abstractmethod
     def frame(self, index: int) -> Frame:
-        """Make the frame of that number.
+        """Return the frame of that index.
 
         Raises:
-            BadFrame: If it cannot be used.
+            BadFrame: If the frame is unusable.
         """
 
     def frames(
@@ -70,9 +71,9 @@ class IndexedSource(Source):
         for index in range(max(start, 0), end):
             try:
                 frame = self.frame(index)
-            except BadFrame as fault:
+            except BadFrame as error:
                 if on_bad_frame is None:
                     raise
-                on_bad_frame(fault)
+                on_bad_frame(error)
                 continue
             yield frame

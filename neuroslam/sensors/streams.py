@@ -1,37 +1,39 @@
-"""Sensors that run at rates of their own, merged by their times."""
+"""Merges a camera and a source of motion of different rates by their times."""
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.source import IndexedSource, OnBadFrame, Source
+from neuroslam.sensors.tracks import time_text
 from neuroslam.types import Frame
 
 SAME_TIME_S = 1e-6
-"""Times nearer than this are one: rounding, not two instants."""
+"""Times that differ by less are equal up to rounding."""
 
-_SENSED = ("ranges", "walls", "heading_rad", "landmarks", "truth")
+_SAMPLED = ("ranges", "walls", "heading_rad", "landmarks", "truth")
 
 
 class Streams(Source):
-    """A camera and a source of motion as one: a frame at every time of either.
+    """A camera and a source of motion as one source, with a frame at every time of either.
 
     A measured motion holds over the interval that ends at its time, so each frame has the motion
-    since the frame before it, and distance and turn are those of the motion source, whatever the
-    two rates are. Pictures come at the times of the camera. Ranges, walls, heading, landmarks and
-    truth are those of the motion source's nearest sample, or else of the camera's, if one is
-    within half of its period. Frames are delivered from the first to the last time that both
-    have, and ``unused`` says how many pictures are not among them; no more than three samples of
-    each are held.
+    since the frame before it: total distance and turn are those of the motion source, whatever the
+    two rates are. Images have the times of the camera. Ranges, walls, heading, landmarks and truth
+    are those of the motion source's nearest sample, or else of the camera's nearest, if it is
+    within half a period. Frames begin when both sources have begun and end with the first that
+    ends; ``unused`` counts the images outside this interval. At most three samples of each source
+    are in memory.
 
     Args:
-        camera: The source with pictures; its motion is not used. If it has none and ``motion``
-            has, they change places.
-        motion: The source with motion.
+        camera: Source of images; its motion is not used. If it has no images and ``motion`` has,
+            the two are exchanged.
+        motion: Source of motion.
 
     Raises:
-        SourceError: If there are no pictures or no motion, or the two do not overlap in time, as
-            far as can be told without reading on; else reading says so.
+        SourceError: If there are no images or no motion, or the two do not overlap in time. An
+            overlap that is only known after reading is checked during reading.
 
     Example:
         >>> from neuroslam.worlds.world import open_world
@@ -48,10 +50,12 @@ class Streams(Source):
             camera, motion, first, second = motion, camera, second, first
         self.name = f"{camera.name}+{motion.name}"
         if first.image is None:
-            raise SourceError(f"{self.name}: neither has pictures; expected a camera and motion")
+            raise SourceError(
+                f"{self.name}: neither source has images; expected a camera and a source of motion"
+            )
         if second.velocity is None:
             raise SourceError(
-                f"{self.name}: {motion.name} has no motion; expected one with speed and turn rate"
+                f"{self.name}: {motion.name} has no motion; expected speed and turn rate"
             )
         self.camera, self.motion = camera, motion
         self.n_frames = None
@@ -59,23 +63,23 @@ class Streams(Source):
         self.live = camera.live or motion.live
         spans = [_span(camera, first), _span(motion, second)]
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
-            raise self._apart(*spans)
+            raise self._no_overlap(*spans)
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
         """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`.
 
-        The ones before ``start`` are read and dropped, and their faults with them.
+        The frames before ``start`` are read and dropped, together with their errors.
         """
         index = 0
 
-        def report(fault: BadFrame) -> None:
+        def report(error: BadFrame) -> None:
             if index < start:
                 return
             if on_bad_frame is None:
-                raise fault
-            on_bad_frame(fault)
+                raise error
+            on_bad_frame(error)
 
         if stop is not None and stop <= max(start, 0):
             return
@@ -90,56 +94,60 @@ class Streams(Source):
         camera, motion = _Cursor(self.camera, report), _Cursor(self.motion, report)
         if camera.next is None or motion.next is None:
             empty = self.camera if camera.next is None else self.motion
-            raise SourceError(f"{self.name}: {empty.name} has no frame that can be used")
-        begin_s = max(camera.next.time_s, motion.next.time_s)
+            raise SourceError(
+                f"{self.name}: {empty.name} has no usable frame; expected at least one"
+            )
         starts = camera.next.time_s, motion.next.time_s
-        passed = 0
+        begin_s = max(starts)
+        skipped = 0
         for cursor in (camera, motion):
             while cursor.next is not None and cursor.next.time_s < begin_s - SAME_TIME_S:
                 cursor.advance()
-                passed += cursor is camera
+                skipped += cursor is camera
         if camera.next is None or motion.next is None:
             for cursor in (camera, motion):
                 while cursor.next is not None:
                     cursor.advance()
-            raise self._apart((starts[0], camera.last.time_s), (starts[1], motion.last.time_s))
-        self.unused = _left_out("begins", begin_s, passed, "before") if passed else ()
+            raise self._no_overlap((starts[0], camera.last_s), (starts[1], motion.last_s))
+        self.unused = _unused("begins", begin_s, skipped, "before") if skipped else ()
         while camera.next is not None and motion.next is not None:
             time_s = min(camera.next.time_s, motion.next.time_s)
-            moved = motion.next.time_s <= time_s + SAME_TIME_S
-            seen = camera.next.time_s <= time_s + SAME_TIME_S
-            # The motion's own time where they are one, so that its intervals stay what they are.
-            time_s = motion.next.time_s if moved else time_s
+            has_motion = motion.next.time_s <= time_s + SAME_TIME_S
+            has_image = camera.next.time_s <= time_s + SAME_TIME_S
+            # Of two equal times that of the motion, so that its intervals keep their lengths.
+            time_s = motion.next.time_s if has_motion else time_s
             near = [frame for frame in (motion.near(time_s), camera.near(time_s)) if frame]
-            sensed = {
+            samples: dict[str, Any] = {
                 field: next((v for v in (getattr(f, field) for f in near) if v is not None), None)
-                for field in _SENSED
+                for field in _SAMPLED
             }
             yield Frame(
                 0,
                 time_s,
-                image=camera.next.image if seen else None,
+                image=camera.next.image if has_image else None,
                 velocity=motion.next.velocity,
-                **sensed,
+                **samples,
             )
-            if moved:
+            if has_motion:
                 motion.advance()
-            if seen:
+            if has_image:
                 camera.advance()
         if camera.next is not None:
             n = None if camera.n_frames is None else camera.n_frames - camera.next.index
-            self.unused += _left_out("ends", motion.last.time_s, n, "after")
+            self.unused += _unused("ends", motion.last_s, n, "after")
 
-    def _apart(self, *spans: tuple[float, float]) -> SourceError:
-        said = (
-            f"{source.name} runs from {low:g} to {high:g} s"
+    def _no_overlap(self, *spans: tuple[float, float]) -> SourceError:
+        runs = (
+            f"{source.name} runs from {time_text(low)} to {time_text(high)}"
             for source, (low, high) in zip((self.camera, self.motion), spans, strict=True)
         )
-        return SourceError(f"{' and '.join(said)}; expected an overlap: are their clocks the same?")
+        return SourceError(
+            f"{' and '.join(runs)}; expected an overlap; check that both use one clock"
+        )
 
 
 class _Cursor:
-    """A source read one frame ahead: the ``last`` frame passed, and the ``next``."""
+    """Reads a source one frame ahead: ``last`` is the present frame, ``next`` the one after it."""
 
     def __init__(self, source: Source, report: Callable[[BadFrame], None]) -> None:
         self.name, self.n_frames = source.name, source.n_frames
@@ -149,23 +157,28 @@ class _Cursor:
         self.last: Frame | None = None
         self.next = next(self.frames, None)
 
+    @property
+    def last_s(self) -> float:
+        """Time of the last frame; -inf before the first."""
+        return -math.inf if self.last is None else self.last.time_s
+
     def advance(self) -> None:
-        """Go to the next frame whose time is later."""
+        """Go to the next frame with a later time."""
         self.last = self.next
         for frame in self.frames:
-            if frame.time_s > self.last.time_s:
+            if frame.time_s > self.last_s:
                 self.next = frame
                 return
             self.report(
                 BadFrame(
-                    f"{self.name}: frame {frame.index}: its time {frame.time_s:g} s is not after "
-                    f"{self.last.time_s:g} s; times must rise"
+                    f"{self.name}: frame {frame.index}: its time {time_text(frame.time_s)} is not "
+                    f"after {time_text(self.last_s)}; times must rise"
                 )
             )
         self.next = None
 
     def near(self, time_s: float) -> Frame | None:
-        """Return the nearest frame, if it is within half a period."""
+        """Return the frame nearest in time, if it is within half a period."""
         gaps = [
             (abs(frame.time_s - time_s), frame.time_s, frame)
             for frame in (self.next, self.last)
@@ -175,24 +188,24 @@ class _Cursor:
         return frame if gap_s <= self.half_period_s + SAME_TIME_S else None
 
 
-def _left_out(what: str, time_s: float, n: int | None, where: str) -> tuple[str]:
-    pictures = (
-        f"the pictures {where} it were"
+def _unused(event: str, time_s: float, n: int | None, side: str) -> tuple[str]:
+    images = (
+        f"the images {side} it were"
         if n is None
-        else (counted(n, f"picture {where} it was", f"pictures {where} it were"))
+        else counted(n, f"image {side} it was", f"images {side} it were")
     )
-    return (f"motion {what} at {round(time_s, 2):.12g} s; {pictures} not used",)
+    return (f"motion {event} at {round(time_s, 2):.12g} s; {images} not used",)
 
 
 def _first_frame(source: Source) -> Frame:
     first = next(source.frames(on_bad_frame=lambda _: None), None)
     if first is None:
-        raise SourceError(f"{source.name}: has no frame that can be used")
+        raise SourceError(f"{source.name}: has no usable frame; expected at least one")
     return first
 
 
 def _span(source: Source, first: Frame) -> tuple[float, float]:
-    """Return the first time of a source and the last, or a bound where only reading would tell."""
+    """Return the first and last time of a source; the last is a bound if it is not yet known."""
     if isinstance(source, IndexedSource):
         for index in range(source.n_frames - 1, first.index, -1):
             last = next(source.frames(index, index + 1, lambda _: None), None)

@@ -1,8 +1,8 @@
-"""Sources without pictures: a CSV of motion, or the track of an animal; and the times of frames.
+"""Sources without images: a motion CSV or the track of an animal; and the clock of all sources.
 
-A motion CSV has a header and one line a frame. It needs the columns ``v_m_s`` and ``w_rad_s`` (or
-``vtrans`` and ``vrot``), may have ``time_s``, and may have the true pose ``x_m``, ``y_m``,
-``theta_rad``, empty where it is not known; other columns are not read.
+A motion CSV has a header and one line per frame. The columns ``v_m_s`` and ``w_rad_s`` (or
+``vtrans`` and ``vrot``) are required. Optional are ``time_s`` and the true pose, ``x_m``, ``y_m``
+and ``theta_rad``, empty where unknown. Other columns are ignored.
 
 A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the times ``t``,
 ``(n,)`` in seconds, or an ``.npy`` with the positions alone.
@@ -25,18 +25,18 @@ from neuroslam.types import Frame, Pose, Velocity
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
 _TRUTH = ("x_m", "y_m", "theta_rad")
-_FASTEST = 1e6  # m/s, rad/s: no robot's, but that of a damaged log, whose sums would overflow
-_MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # a pickle, an .npz and an .npy begin so
-_EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), if you like time_s, and x_m,y_m,theta_rad"
+_MAX_SPEED = 1e6  # m/s, rad/s: only a damaged log has more, and its sums could overflow
+_MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
+_EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s and x_m,y_m,theta_rad"
 
 
 class Clock:
-    """The times of the frames of a source: given ones, which must rise, or ``index / rate``.
+    """Times of the frames of a source: recorded times, which must rise, or ``index / rate``.
 
     Args:
-        name: The source, for messages.
-        times_s: Times in seconds, ``(n,)``, or ``None`` where the source has none.
-        frame_rate_hz: Frames per second where it has none.
+        name: Name of the source, for messages.
+        times_s: Recorded times in seconds, ``(n,)``; ``None`` if there are none.
+        frame_rate_hz: Frames per second if there are no times.
 
     Example:
         >>> Clock("walk", None, 20.0).at(3)
@@ -51,46 +51,65 @@ class Clock:
         self.times_s = times_s
         self.frame_rate_hz = frame_rate_hz
         if times_s is not None:
-            finite = np.where(np.isfinite(times_s), times_s, -np.inf)
-            latest = np.maximum.accumulate(finite)
-            self._before = np.concatenate([[-np.inf], latest[:-1]])
-            steps = np.diff(times_s[self.usable])
+            self._before = _latest_before(times_s)
+            steps = np.diff(times_s[rising(times_s)])
             self.frame_rate_hz = 1.0 / float(np.median(steps)) if len(steps) else frame_rate_hz
-
-    @property
-    def usable(self) -> np.ndarray:
-        """Which of the given times are finite and later than all before, ``(n,)`` bool."""
-        return np.isfinite(self.times_s) & (self.times_s > self._before)
 
     def at(self, index: int) -> float:
         """Return the time of a frame in seconds.
 
         Raises:
-            BadFrame: If it is not finite or not later than those before.
+            BadFrame: If the time is not finite, or not later than all times before it.
         """
         if self.times_s is None:
             return index / self.frame_rate_hz
         time_s = float(self.times_s[index])
         if not np.isfinite(time_s):
-            raise BadFrame(f"{self.name}: frame {index}: its time is {time_s}; expected a number")
+            raise BadFrame(f"{self.name}: frame {index}: its time is {time_s} s; expected a number")
         if not time_s > self._before[index]:
             raise BadFrame(
-                f"{self.name}: frame {index}: its time {time_s:g} s is not after "
-                f"{self._before[index]:g} s; times must rise"
+                f"{self.name}: frame {index}: its time {time_text(time_s)} is not after "
+                f"{time_text(self._before[index])}; times must rise"
             )
         return time_s
 
 
+def rising(times_s: np.ndarray) -> np.ndarray:
+    """Return which times are finite and later than all times before them, ``(n,)`` bool.
+
+    Example:
+        >>> rising(np.array([0.0, 0.5, 0.25, np.nan, 1.0])).tolist()
+        [True, True, False, False, True]
+    """
+    return np.asarray(np.isfinite(times_s) & (times_s > _latest_before(times_s)))
+
+
+def _latest_before(times_s: np.ndarray) -> np.ndarray:
+    """Return the latest finite time before each, ``(n,)``; -inf if there is none."""
+    latest = np.maximum.accumulate(np.where(np.isfinite(times_s), times_s, -np.inf))
+    return np.concatenate([[-np.inf], latest[:-1]])
+
+
+def time_text(time_s: float) -> str:
+    """Write a time to the microsecond, without trailing zeros; a Unix time keeps all digits.
+
+    Example:
+        >>> time_text(0.25), time_text(1700000000.0500001)
+        ('0.25 s', '1700000000.05 s')
+    """
+    return f"{round(time_s, 6):.16g} s"
+
+
 @dataclass(frozen=True)
 class Track:
-    """Measured motion, one row a frame.
+    """Measured motion, one row per frame.
 
     Attributes:
-        name: Where it comes from, for messages.
+        name: Name of the file, for messages.
         velocities: Forward speed (m/s) and turn rate (rad/s), ``(n, 2)``.
-        times_s: ``(n,)``, or ``None``.
-        truth: True poses, ``(n, 3)``, NaN where unknown, or ``None``.
-        rows: How each row is called in messages.
+        times_s: Times in seconds, ``(n,)``; ``None`` if there are none.
+        truth: True poses, ``(n, 3)``, NaN where unknown; ``None`` if there are none.
+        rows: Name of each row, for messages.
     """
 
     name: str
@@ -103,25 +122,25 @@ class Track:
         """Return the motion over the interval that ends at that frame.
 
         Raises:
-            BadFrame: If it is not finite, or no robot's.
+            BadFrame: If the motion is not finite, or impossibly fast.
         """
         v, w = self.velocities[index].tolist()
-        if not (abs(v) <= _FASTEST and abs(w) <= _FASTEST):  # NaN too
+        if not (abs(v) <= _MAX_SPEED and abs(w) <= _MAX_SPEED):  # NaN too
             raise BadFrame(
                 f"{self.name}: frame {index} ({self.rows[index]}): its motion is v = {v} m/s, "
-                f"w = {w} rad/s; expected finite numbers, at most {_FASTEST:g}"
+                f"w = {w} rad/s; expected finite numbers, at most {_MAX_SPEED:,.0f}"
             )
         return Velocity(v, w)
 
     def pose(self, index: int) -> Pose | None:
-        """Return the true pose at that frame, or ``None`` where it is not known."""
+        """Return the true pose at that frame, or ``None`` if it is unknown."""
         if self.truth is None or not np.isfinite(self.truth[index]).all():
             return None
         return Pose(*self.truth[index].tolist())
 
 
 class TrackSource(IndexedSource):
-    """Frames that hold motion, and the true pose where it is known, but no picture."""
+    """Source of frames with motion, and the true pose if known, but without images."""
 
     def __init__(self, track: Track, frame_rate_hz: float) -> None:
         self.name = track.name
@@ -131,23 +150,23 @@ class TrackSource(IndexedSource):
         self.frame_rate_hz = self.clock.frame_rate_hz
 
     def frame(self, index: int) -> Frame:
-        """Make the frame of that number, see :meth:`IndexedSource.frame`."""
+        """Return the frame of that index, see :meth:`IndexedSource.frame`."""
         time_s = self.clock.at(index)
         velocity = self.track.velocity(index)
         return Frame(index, time_s, velocity=velocity, truth=self.track.pose(index))
 
 
 def parse_motion(text: str, name: str) -> Track:
-    r"""Read a motion CSV, as the head of this module describes it.
+    r"""Read a motion CSV; the module's docstring describes its format.
 
     Raises:
-        SourceError: If it is empty, lacks a column, or a line does not fit the header.
+        SourceError: If the table is empty, lacks a column, or a line does not fit the header.
 
     Example:
         >>> parse_motion("vtrans,vrot\n0.5,0.1\n", "walk.csv").velocity(0)
         Velocity(v_m_s=0.5, w_rad_s=0.1)
     """
-    table, rows = parse_table(text, name, _MOTION, _EXPECTED, optional=("time_s",), whole=_TRUTH)
+    table, rows = parse_table(text, name, _MOTION, _EXPECTED, optional=("time_s",), together=_TRUTH)
     return Track(
         name,
         np.column_stack([table[field] for field in _MOTION]),
@@ -163,23 +182,23 @@ def parse_table(
     needed: Sequence[str],
     expected: str,
     optional: Sequence[str] = (),
-    whole: Sequence[str] = (),
+    together: Sequence[str] = (),
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    r"""Read the numbers of a CSV that has a header; an empty field is NaN.
+    r"""Read a CSV of numbers with a header; an empty field is NaN.
 
     Args:
-        text: What the file holds.
-        name: The file, for messages.
-        needed: Columns it must have.
-        expected: What to say it should have had.
-        optional: Columns it may have.
-        whole: Columns of which it has all or none.
+        text: Content of the file.
+        name: Name of the file, for messages.
+        needed: Required columns.
+        expected: Description of the expected columns, for messages.
+        optional: Optional columns.
+        together: Optional columns that are complete or absent.
 
     Returns:
-        The columns, each ``(n,)``; how each row is called in messages.
+        The columns by name, each ``(n,)``; the name of each row, for messages.
 
     Raises:
-        SourceError: If it is empty, lacks a column, or a line does not fit the header.
+        SourceError: If the table is empty, lacks a column, or a line does not fit the header.
 
     Example:
         >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "")[0]["y_m"]
@@ -188,25 +207,25 @@ def parse_table(
     reader = csv.reader(io.StringIO(text))
     numbered = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
     if not numbered:
-        raise SourceError(f"{name}: is empty; {expected}, and a line for each frame")
+        raise SourceError(f"{name}: is empty; {expected}, and one line per frame")
     header = [field.strip().lower() for field in numbered[0][1]]
     columns = [_ALIASES.get(field, field) for field in header]
-    needed = [*needed, *(whole if any(field in columns for field in whole) else ())]
+    needed = [*needed, *(together if any(field in columns for field in together) else ())]
     missing = [field for field in needed if field not in columns]
     if missing:
         raise SourceError(
-            f"{name}: has the columns {','.join(header)[:100]} and no {missing[0]}; {expected}"
+            f"{name}: has the columns {','.join(header)[:100]}, but no {missing[0]}; {expected}"
         )
     if len(numbered) == 1:
-        raise SourceError(f"{name}: has a header and no lines after it; expected one a frame")
+        raise SourceError(f"{name}: has a header, but no lines; expected one line per frame")
     wanted = [*(field for field in optional if field in columns), *needed]
-    places = [columns.index(field) for field in wanted]
+    numbers = [columns.index(field) for field in wanted]
     values = np.empty((len(numbered) - 1, len(wanted)))
     for out, (line, row) in zip(values, numbered[1:], strict=True):
         if len(row) != len(columns):
             raise SourceError(f"{name}: line {line} has {len(row)} values; expected {len(columns)}")
-        for at, place in enumerate(places):
-            out[at] = _number(row[place], name, line, wanted[at])
+        for at, number in enumerate(numbers):
+            out[at] = _number(row[number], name, line, wanted[at])
     rows = [f"line {line}" for line, _ in numbered[1:]]
     return dict(zip(wanted, values.T, strict=True)), rows
 
@@ -221,16 +240,16 @@ def _number(text: str, name: str, line: int, column: str) -> float:
 
 
 def read_track(path: Path, frame_rate_hz: float) -> Track:
-    """Read a track, as the head of this module describes it: positions become motion and truth.
+    """Read a track as motion and truth; the module's docstring describes its format.
 
     Raises:
-        SourceError: If the file is damaged, holds pickled objects, or has other arrays in it.
+        SourceError: If the file is damaged, contains pickled objects, or lacks the arrays.
     """
     _, times, positions = read_positions(path)
     n = len(positions)
     usable = np.isfinite(positions).all(axis=1)
     if times is not None:
-        usable &= Clock(str(path), times, frame_rate_hz).usable
+        usable &= rising(times)
     clock = np.arange(n) / frame_rate_hz if times is None else times
     velocities, truth = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
     if usable.any():
@@ -239,10 +258,14 @@ def read_track(path: Path, frame_rate_hz: float) -> Track:
 
 
 def read_positions(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray]:
-    """Read all arrays of a track's file, and of them the times and positions, both ``float64``.
+    """Read the file of a track.
+
+    Returns:
+        All arrays of the file by name; the times, ``(n,)`` in s, or ``None``; the positions,
+        ``(n, 2)`` in m.
 
     Raises:
-        SourceError: If the file is damaged, holds pickled objects, or has other arrays in it.
+        SourceError: If the file is damaged, contains pickled objects, or lacks the arrays.
     """
     arrays = _load_arrays(path)
     if "pos" not in arrays or ("t" not in arrays and path.suffix == ".npz"):
@@ -263,15 +286,15 @@ def read_positions(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None
 
 
 def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Turn positions into motion along the path: turn to face the next position, then go there.
+    r"""Convert positions to motion along the path: turn towards the next position, then move.
 
     .. math:: v_k = |p_k - p_{k-1}| / \Delta t, \quad w_k = (h_k - h_{k-1}) / \Delta t
 
-    The heading :math:`h_k` is that of the step; who stands still keeps it. Dead-reckoning the
-    result with :func:`neuroslam.geometry.integrate_velocities` gives the positions again.
+    The heading :math:`h_k` is the direction of the step; without a step it stays. Dead reckoning
+    with :func:`neuroslam.geometry.integrate_velocities` restores the positions.
 
     Args:
-        times_s: ``(n,)``, rising.
+        times_s: Rising times in seconds, ``(n,)``.
         positions: ``(n, 2)`` in metres.
 
     Returns:
@@ -300,16 +323,16 @@ def _load_arrays(path: Path) -> dict[str, np.ndarray]:
                 return {"pos": loaded}
             return {key: loaded[key] for key in loaded.files}
     except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
-        if "pickle" in str(error):  # numpy says so of whatever it does not know
+        if "pickle" in str(error):  # numpy's message for every unknown format
             with path.open("rb") as file:
                 pickled = file.read(6).startswith(_MAY_HOLD_PICKLES)
             raise SourceError(
-                f"{path}: holds pickled objects, which are never loaded; expected plain arrays"
+                f"{path}: contains pickled objects, which are never loaded; expected plain arrays"
                 if pickled
-                else f"{path}: is not an .npz or .npy file; expected one that numpy wrote"
+                else f"{path}: is not an .npz or .npy file; expected one written by numpy"
             ) from None
         raise SourceError(
-            f"{path}: is not a whole .npz or .npy file ({_first_line(error)})"
+            f"{path}: is damaged or incomplete ({_first_line(error)}); expected an .npz or .npy"
         ) from None
 
 

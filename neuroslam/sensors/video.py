@@ -18,20 +18,20 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".ogv", ".mjpeg", ".mjpg", ".3gp"),
 )
 
-# These write down how many frames they hold. Of the others the decoder gives an estimate, from the
-# duration and the frame rate, that a whole file may miss on either side.
+# These containers store their number of frames. For the others the decoder estimates it from the
+# duration and the frame rate, and the true number may be lower or higher.
 _COUNTED = (".avi", ".mp4", ".m4v", ".mov", ".3gp")
 
 
 class VideoSource(Source):
-    """The frames of a video, in grey, at ``index / fps``.
+    """Grey frames of a video, at times ``index / fps``.
 
     Args:
         path: The file.
-        frame_rate_hz: Used where the container states no frame rate.
+        frame_rate_hz: Frame rate, if the container states none.
 
     Raises:
-        SourceError: If it is not a video or has no frames.
+        SourceError: If the file is not a video or has no frames.
     """
 
     def __init__(self, path: Path, frame_rate_hz: float) -> None:
@@ -41,48 +41,51 @@ class VideoSource(Source):
             fps = capture.get(cv2.CAP_PROP_FPS)
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             with quiet_opencv():
-                there_is_one, image = capture.read()
-        if not there_is_one:
-            raise SourceError(f"{self.name}: has no frames that can be decoded; is it truncated?")
+                success, image = capture.read()
+        if not success:
+            raise SourceError(
+                f"{self.name}: no frame can be decoded; expected a complete video file"
+            )
         self.image_shape = image.shape[:2]
-        self.frame_rate_hz = fps if math.isfinite(fps) and fps > 0 else frame_rate_hz
-        counted = self.path.suffix.lower() in _COUNTED and count > 0
-        self.n_frames = int(count) if counted else None
+        self._rate_hz = fps if math.isfinite(fps) and fps > 0 else frame_rate_hz
+        self.frame_rate_hz = self._rate_hz
+        is_counted = self.path.suffix.lower() in _COUNTED and count > 0
+        self.n_frames = int(count) if is_counted else None
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
         """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`.
 
-        Frames before ``start`` are decoded and dropped, as seeking is not exact. A video that ends
-        before the number of frames that its container announces has one last bad frame.
+        Frames before ``start`` are decoded and dropped, as seeking is not exact. A video with fewer
+        frames than its container states ends with one bad frame.
         """
         with self._capture() as capture:
             index = 0
             while stop is None or index < stop:
                 with quiet_opencv():
-                    there_is_one = capture.grab()
-                if not there_is_one:
+                    success = capture.grab()
+                if not success:
                     break
                 if index >= start:
                     try:
                         frame = self._retrieve(capture, index)
-                    except BadFrame as fault:
+                    except BadFrame as error:
                         if on_bad_frame is None:
                             raise
-                        on_bad_frame(fault)
+                        on_bad_frame(error)
                     else:
                         yield frame
                 index += 1
-        missing = self.n_frames is not None and index < self.n_frames
-        if missing and (stop is None or index < stop):
-            fault = BadFrame(
-                f"{self.name}: frame {index} is missing: it ends there, its container announces "
-                f"{counted(self.n_frames, 'frame')}; is it truncated?"
+        n_frames = index if self.n_frames is None else self.n_frames
+        if index < n_frames and (stop is None or index < stop):
+            missing = BadFrame(
+                f"{self.name}: frame {index} is missing; expected {counted(n_frames, 'frame')}, as "
+                "the container states; check that the file is complete"
             )
             if on_bad_frame is None:
-                raise fault
-            on_bad_frame(fault)
+                raise missing
+            on_bad_frame(missing)
 
     def _retrieve(self, capture: cv2.VideoCapture, index: int) -> Frame:
         with quiet_opencv():
@@ -91,17 +94,17 @@ class VideoSource(Source):
             raise BadFrame(f"{self.name}: frame {index} cannot be decoded")
         require_shape(image[..., 0], self.image_shape, self.name, index)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        return Frame(index, index / self.frame_rate_hz, image=grey)
+        return Frame(index, index / self._rate_hz, image=grey)
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:
-        # FFmpeg alone, where there is one: OpenCV's other readers print what they cannot read.
+        # FFmpeg only, if available: OpenCV's other readers print their errors.
         ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
         with quiet_opencv(), _quiet_ffmpeg():
             capture = cv2.VideoCapture(self.name, cv2.CAP_FFMPEG if ffmpeg else cv2.CAP_ANY)
         try:
             if not capture.isOpened():
-                raise SourceError(f"{self.name}: is not a video that can be read, or is truncated")
+                raise SourceError(f"{self.name}: cannot be read; expected a complete video file")
             yield capture
         finally:
             capture.release()
@@ -109,7 +112,7 @@ class VideoSource(Source):
 
 @contextmanager
 def _quiet_ffmpeg() -> Iterator[None]:
-    """Keep FFmpeg from printing; it reads this variable when the first video is opened."""
+    """Keep FFmpeg from printing; it reads this variable when it opens the first video."""
     key = "OPENCV_FFMPEG_LOGLEVEL"
     if key in os.environ:
         yield

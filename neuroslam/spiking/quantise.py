@@ -6,10 +6,14 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+from neuroslam.config.semantic import SSPSLAMConfig
+from neuroslam.errors import SpaceError
 from neuroslam.spiking.ensemble import NeuronArray
 
 WEIGHT_BITS = 8
 _WEIGHTS = ("weights", "bias", "decoders", "encoders", "error_decoders", "relay_decoders")
+
+_TUNED_TO_KEYS = 20.0  # ratio of the squared rates of neurons tuned to a key, to others
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -56,3 +60,32 @@ def quantised(module: Module, bits: int = WEIGHT_BITS) -> Module:
             if value is not None and value.ndim > 1:
                 setattr(part, name, rounded(value, bits))
     return module
+
+
+def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
+    """Return a config for a neuromorphic chip: no function outside of neurons.
+
+    Raises:
+        SpaceError: If the tier is not ``spiking``.
+    """
+    if config.tier != "spiking":
+        raise SpaceError(
+            f"SSPSLAM: quantised neurons spike, but the tier is {config.tier!r}; set tier to "
+            "'spiking'"
+        )
+    return config.model_copy(
+        update={
+            "neurons": config.neurons.model_copy(update={"model": "stepped_lif"}),
+            "integrator": config.integrator.model_copy(update={"coupling": "none"}),
+            "map": config.map.model_copy(
+                update={
+                    "voja_rate": 0.0,
+                    "plasticity": "constant",
+                    "pes_rate": config.map.pes_rate / _TUNED_TO_KEYS,
+                }
+            ),
+            "binding": "neurons",
+            "vector_neurons": config.vector_neurons or config.map.neurons,
+            "relocalise_after_s": 0.0,
+        }
+    )

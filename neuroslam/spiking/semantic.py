@@ -1,4 +1,4 @@
-"""The semantic cells of a brain: SSP-SLAM that meets new landmarks as it goes, in metres."""
+"""Semantic cells of a brain: SSP-SLAM with a vocabulary of landmarks that grows."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from neuroslam.config import BrainConfig
 from neuroslam.config.semantic import SemanticConfig
@@ -14,8 +14,9 @@ from neuroslam.errors import MapError, listed
 from neuroslam.geometry import wrap_angle
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.spiking.decoding import PositionDecoder
-from neuroslam.spiking.landmark_frames import from_frame, into_frame, rotated, shared_frames
+from neuroslam.spiking.landmark_frames import from_frame, into_frame, shared_frames
 from neuroslam.spiking.landmark_matching import match_landmarks
+from neuroslam.spiking.semantic_joining import merge_landmarks
 from neuroslam.spiking.sightings import (
     LEAST_SEEN,
     NAMED,
@@ -25,6 +26,7 @@ from neuroslam.spiking.sightings import (
     Sightings,
 )
 from neuroslam.spiking.slam import SSPSLAM, SSPStep
+from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, landmark_pointer
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, without_gradients
@@ -38,43 +40,43 @@ from neuroslam.state.population import (
     StepInput,
 )
 from neuroslam.state.registry import register
-from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Frame, Motion, Pose, PoseEstimate
 from neuroslam.worlds.landmarks import LandmarkView
 
+Follows = Literal["nothing", "map", "cells"]
+"""What semantic cells are anchored to."""
+
 _KINDS = ("landmark", "view", "nameless")
-_KNOWN = 0.5  # strength of a recall from which a landmark is known
-_CLEAR = 0.7  # of its strength, that a recall is like the place that is read from it
-_STEPS = 3  # of Newton's method, from where a landmark is seen to where it is recalled
-_CONSENSUS = 3  # known landmarks in sight, from which on they can outvote one
-_MOVED_M = 0.05  # by which a landmark moves with its experience before memory is rewritten
-_NEAR_M = 0.5  # nearer landmarks say nothing of the heading
+_KNOWN = 0.5  # strength of recall above which a landmark is known
+_CLEAR = 0.7  # similarity of recall and decoded position, as a share of the strength
+_STEPS = 3  # Newton steps from the observed to the recalled position
+_CONSENSUS = 3  # known landmarks in sight that can reject an outlier
+_MOVED_M = 0.05  # movement of a landmark with its experience that rewrites the memory
+_NEAR_M = 0.5  # nearer landmarks do not correct the heading
 
 
 @register("semantic")
 class SemanticCells(Population):
-    r"""Learns where landmarks are, as vectors, and is corrected by those that it knows.
+    r"""Learns the positions of landmarks as vectors, and corrects the robot's pose by known ones.
 
-    One animal of :class:`~neuroslam.spiking.slam.SSPSLAM`, with a vocabulary that grows: a pointer
-    of a landmark follows from its kind and number, so that it is the same in every session. Each
-    landmark in sight is first named: nameless ones by the place where they seem to be; those are
-    dropped that most others in sight contradict.
+    One animal of :class:`~neuroslam.spiking.slam.SSPSLAM` with a vocabulary that grows: the pointer
+    of a landmark follows from its kind and number, so it is the same in every session. Landmarks in
+    sight are first identified, nameless ones by position; outliers among them are rejected.
 
-    State: ``known``, a row for each landmark (kind, number, place as recalled, how often seen,
-    how sure the robot was of its own place), ``slam`` and the heading in ``now``.
+    State: ``known`` (:class:`~neuroslam.spiking.vocabulary.Vocabulary`), ``slam``, and ``now``.
 
     Args:
         config: Of SSP-SLAM and of what a landmark is.
-        heading_rad: At the start.
-        follows: ``nothing``: the cells are alone; ``map``: landmarks are kept with the experiences
-            of a map, and move with them; ``cells``: others believe where the robot is, and weigh
-            themselves what landmarks tell: the memory pulls at nothing.
+        heading_rad: Heading at the start.
+        follows: ``nothing``: the cells lead; ``map``: landmarks are anchored to the experiences of
+            a map that relaxes, and move with them; ``cells``: other cells estimate the pose and
+            weigh landmarks themselves, so that these cells are not corrected by their memory.
 
     Example:
         >>> cells = SemanticCells(SemanticConfig())
         >>> door = Sightings.of(np.array([[7.0, 2.0, 0.0]]))
         >>> for _ in range(20):
-        ...     told = cells.advance(Motion(0.0, 0.0, 0.1), door)
+        ...     update = cells.advance(Motion(0.0, 0.0, 0.1), door)
         >>> cells.landmarks()["place_m"].round(1).tolist() == [[2, 0]]
         True
     """
@@ -86,7 +88,11 @@ class SemanticCells(Population):
     @classmethod
     def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
         """Make the semantic cells of a brain."""
-        follows = "nothing" if leader is cls else "map" if leader.relaxes_map else "cells"
+        follows: Follows = "cells"
+        if leader is cls:
+            follows = "nothing"
+        elif leader.relaxes_map:
+            follows = "map"
         cells = cls(config.semantic, math.radians(config.map.initial_heading_deg), follows)
         if "markers" in config.semantic.landmarks:
             c = config.semantic
@@ -99,67 +105,48 @@ class SemanticCells(Population):
         self,
         config: SemanticConfig,
         heading_rad: float = 0.0,
-        follows: Literal["nothing", "map", "cells"] = "nothing",
+        follows: Follows = "nothing",
     ) -> None:
         super().__init__()
         self.config = config
         self.follows = follows
-        self.detector: MarkerDetector | None = None  # of landmarks in pictures
+        self.detector: MarkerDetector | None = None  # of markers in images
         self._update: LandmarkUpdate | None = None  # of the last frame
-        self.known = GrowingTable(
-            {
-                "kind": ((), torch.int64),
-                "number": ((), torch.int64),
-                "place_m": ((2,), torch.float64),
-                "seen": ((), torch.int64),
-                "variance_m2": ((), torch.float64),
-                "first_frame": ((), torch.int64),
-                "experience": ((), torch.int64),
-                "offset_m": ((2,), torch.float64),
-            }
-        )
+        self.known = Vocabulary()
         pulls = config.model_copy(update={"gain": 0.0}) if follows == "cells" else config
-        self.slam = SSPSLAM(pulls, _pointer(config, NAMED, 0)[None])
+        self.slam = SSPSLAM(pulls, landmark_pointer(config, NAMED, 0)[None])
         self.decoder = PositionDecoder(self.slam.space)
-        self.now = Scalars(
-            heading_rad=heading_rad,
-            owed_s=0.0,  # of time that no whole step has lived yet
-            frame=-1,
-            told=-1,  # landmark that has told where the robot is, in this turn of attention
-        )
+        self.now = SemanticState(heading_rad)
         self.slam.start(torch.zeros(1, 2))
-        self.watch: Callable[[int, SSPStep], None] | None = None  # a recorder's, of each step
-        self._rows: dict[tuple[int, int], int] = {}
+        self.watch: Callable[[int, SSPStep], None] | None = (
+            None  # a recorder's, called in each step
+        )
         self.register_load_state_dict_pre_hook(_take_pointers)
-        self.register_load_state_dict_post_hook(lambda module, _: module._index())
+        self.register_load_state_dict_post_hook(lambda cells, _: cells.known.index())
 
     @property
     def n(self) -> int:
-        """Number of landmarks that count: seen more than a time or two."""
-        return int(self.confirmed().sum())
-
-    def confirmed(self) -> Tensor:
-        """Tell of each row of ``known`` whether it was seen so often that it is no mistake."""
-        return (self.known["seen"] >= LEAST_SEEN) | (self.known["kind"] == VIEW)
+        """Number of confirmed landmarks."""
+        return int(self.known.confirmed().sum())
 
     @property
     def pose(self) -> Pose:
-        """Where the cells say that the robot is."""
+        """Pose of the robot, as the cells estimate it."""
         x, y = self.slam.integrator.position_m[0].tolist()
         return Pose(x, y, self.now.heading_rad)
 
     def landmarks(self) -> dict[str, np.ndarray]:
-        """Return the columns of the landmarks that count, and their names."""
-        rows = self.confirmed()
+        """Return the columns of the confirmed landmarks, and their names."""
+        rows = self.known.confirmed()
         columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
         both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
         return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
 
     def observe(self, frame: Frame) -> Sightings:
-        """Return the landmarks in sight: those that the source gives, and markers in the picture.
+        """Return the landmarks in sight: those of the source, and markers in the image.
 
         Raises:
-            BadFrame: If they cannot be that.
+            BadFrame: If they are invalid.
         """
         tables = []
         if "given" in self.config.landmarks and frame.landmarks is not None:
@@ -169,7 +156,7 @@ class SemanticCells(Population):
         return Sightings.of(*tables)
 
     def check(self, now: StepInput, observation: Observation, belief: Belief | None) -> None:
-        """Refuse a frame that would take the robot out of the space of the vectors.
+        """Raise if a frame takes the robot out of the space of the semantic pointers.
 
         Raises:
             MapError: If so.
@@ -191,10 +178,10 @@ class SemanticCells(Population):
     def recall(
         self, now: StepInput, observation: Sightings, belief: Belief | None
     ) -> Correction | None:
-        """Learn the landmarks in sight, and tell where known ones put the robot.
+        """Learn the landmarks in sight, and return the correction by known ones.
 
-        A map whose relaxation has moved the robot out of the space is not corrected; the next frame
-        is refused.
+        If relaxation of the map has moved the robot out of the space, there is no correction, and
+        the next frame is refused.
         """
         self._update = None
         if belief is not None and not self._is_inside(belief.pose[:2]):
@@ -227,7 +214,7 @@ class SemanticCells(Population):
 
     @property
     def lost(self) -> bool:
-        """Whether a known landmark has just put the robot where it was not believed to be."""
+        """Whether a known landmark has relocalised the robot in the last frame."""
         return self._update is not None and self._update.lost
 
     def belief(self, map_: LeadableMap) -> Belief:
@@ -235,7 +222,7 @@ class SemanticCells(Population):
         return Belief(self.pose)
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
-        """Go to the experience of the landmark that is attended to; each landmark is one."""
+        """Go to the experience of the attended landmark; each landmark is an experience."""
         row = -1 if self._update is None else self._update.landmark
         experience, at = self.experience_of(row, map_.n)
         return Decision(*map_.visit(experience, self.pose, now.motion.dt_s, now.frame, at))
@@ -247,11 +234,11 @@ class SemanticCells(Population):
         return np.concatenate([z.real, z.imag])
 
     def counts(self) -> dict[str, float]:
-        """Return the number of landmarks that count."""
+        """Return the number of confirmed landmarks."""
         return {"landmarks": self.n}
 
     def scalars(self) -> dict[str, float]:
-        """Return what TensorBoard shows."""
+        """Return the TensorBoard curves."""
         return {
             "semantic/landmarks": float(self.n),
             "semantic/contradicted_s": float(self.slam.contradicted_s[0]),
@@ -268,7 +255,7 @@ class SemanticCells(Population):
         }
 
     def points_m(self) -> np.ndarray:
-        """Return where landmarks are on the map, ``(n, 2)``, views left out."""
+        """Return the positions of landmarks, ``(n, 2)``, without views."""
         known = self.landmarks()
         return known["place_m"][known["kind"] != VIEW]
 
@@ -276,7 +263,7 @@ class SemanticCells(Population):
     def faults(
         cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
     ) -> Iterator[str]:
-        """Say where pointers are missing, or landmarks were met at experiences that are not."""
+        """Yield missing pointers, and references to experiences that do not exist."""
         pointers, kinds = len(state["slam.pointers"]), len(state["known.kind"])
         if pointers != max(1, kinds):
             yield f"{kinds} landmarks, {pointers} pointers; each should have its own"
@@ -304,7 +291,7 @@ class SemanticCells(Population):
             motion: Since the last frame.
             seen: Landmarks in sight at its end.
             compass_rad: Measured heading; ``None``: it is integrated.
-            belief: Where a map or other cells say that the robot is; ``None``: it is alone.
+            belief: Pose by a map or other cells that lead; ``None``: these cells lead.
             frame: Number of the frame.
 
         Raises:
@@ -321,13 +308,13 @@ class SemanticCells(Population):
         self._stay_inside(here)
         now.heading_rad, now.frame = heading, frame
         if belief is not None and math.hypot(*step) > float(self.slam.space.length_scale_m.min()):
-            self.slam.start(torch.tensor([here]))  # others have jumped
+            self.slam.start(torch.tensor([here]))  # the leader has relocalised
             step = (0.0, 0.0)
         angle = seen.bearing_rad + heading
         vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * seen.distance_m[:, None]
         places = np.array(here) + vectors
-        rows, fresh = self._name(seen, places, belief)
-        good = self._agreeing(rows, fresh, places)
+        rows, fresh = self._identify(seen, places, belief)
+        good = self._inliers(rows, fresh, places)
         rows, vectors, kind = rows[good], vectors[good], seen.kind[good]
         attended, strength, gate, lost = self._steps(motion.dt_s, step, rows, vectors)
         if attended < 0:
@@ -341,7 +328,7 @@ class SemanticCells(Population):
             now.told = attended
             place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
         lost = lost and self._is_inside(place)
-        if lost:  # its landmarks contradict for long: it was kidnapped, or has drifted far
+        if lost:  # landmarks contradicted for long: kidnapped, or much drift
             self.relocalise(place)
         correction, turn = (0.0, 0.0), 0.0
         if self.follows != "cells":
@@ -356,13 +343,13 @@ class SemanticCells(Population):
 
     @without_gradients
     def follow_map(self, poses: np.ndarray) -> bool:
-        """Move landmarks with the experiences at which they were met, as the map was relaxed.
+        """Move landmarks with the experiences they are anchored to, after relaxation of the map.
 
         Args:
-            poses: Of all experiences, ``(n, 3)``.
+            poses: Poses of all experiences, ``(n, 3)``.
 
         Returns:
-            Whether one moved so far that the memory was written anew.
+            Whether a landmark moved so far that the memory was rewritten.
         """
         anchor = self.known["experience"].numpy()
         rows = np.flatnonzero(anchor >= 0)
@@ -373,11 +360,11 @@ class SemanticCells(Population):
         if np.abs(there - place[rows]).max() < _MOVED_M:
             return False
         self.known["place_m"][rows] = torch.from_numpy(there)
-        self._write()
+        self.write_memory()
         return True
 
-    def _write(self) -> None:
-        """Make every landmark recall the place where it is noted to be."""
+    def write_memory(self) -> None:
+        """Rewrite the memory so that every landmark recalls its position in ``known``."""
         slam = self.slam
         places = slam.space.encode(self.known["place_m"].to(slam.pointers)).detach()
         slam.map.write(slam.pointers, places)
@@ -385,11 +372,11 @@ class SemanticCells(Population):
             slam.places.write(places, slam.pointers)
 
     def experience_of(self, row: int, n: int) -> tuple[int, Pose | None]:
-        """Return the place of a map that a landmark is, and where; each is one, where it is alone.
+        """Return the experience that a landmark is, and its pose, where these cells lead the map.
 
         Args:
-            row: Of the landmark, or -1.
-            n: Places that the map has; a landmark that is none becomes the next.
+            row: Row of the landmark, or -1.
+            n: Number of experiences; a new landmark becomes the next one.
         """
         if row < 0 or int(self.known["seen"][row]) < LEAST_SEEN:
             return -1, None
@@ -399,7 +386,7 @@ class SemanticCells(Population):
         return int(self.known["experience"][row]), Pose(x, y, self.now.heading_rad)
 
     def relocalise(self, place_m: tuple[float, float]) -> None:
-        """Put the animal somewhere; what it has learnt stays."""
+        """Set the position of the robot; its memory stays."""
         self._stay_inside(place_m)
         self.slam.start(torch.tensor([place_m]))
 
@@ -414,41 +401,26 @@ class SemanticCells(Population):
         low, high = self.slam.space.bounds_m.T.tolist()
         return all(a <= x <= b for a, x, b in zip(low, place_m, high, strict=True))
 
-    def _name(
+    def _identify(
         self, seen: Sightings, places_m: np.ndarray, belief: Belief | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Say which row each landmark in sight has, -1 for none, and which rows are new."""
+        """Identify each landmark in sight: its row, -1 for none, and whether it is new."""
         rows = np.full(len(seen.kind), -1)
         fresh = np.zeros(len(rows), dtype=bool)
         for i, (kind, number) in enumerate(zip(seen.kind.tolist(), seen.number.tolist(),
                                                strict=True)):  # fmt: skip
             if kind == NAMELESS:
-                rows[i], number = self._nearest(places_m[i])
+                rows[i], number = self.known.nearest_nameless(places_m[i], self.config.same_m)
             else:
-                rows[i] = self._rows.get((kind, number), -1)
+                rows[i] = self.known.row_of.get((kind, number), -1)
             if rows[i] < 0 and number >= 0:
-                rows[i], fresh[i] = self._meet(kind, number, places_m[i], belief), True
+                rows[i], fresh[i] = self._add(kind, number, places_m[i], belief), True
             if rows[i] >= 0:
                 self.known["seen"][rows[i]] += 1
         return rows, fresh
 
-    def _nearest(self, place_m: np.ndarray) -> tuple[int, int]:
-        """Row of the nameless landmark there, or -1 and a number for it, or none where in doubt."""
-        mine = np.flatnonzero(self.known["kind"].numpy() == NAMELESS)
-        if not len(mine):
-            return -1, 0
-        away = np.linalg.norm(self.known["place_m"].numpy()[mine] - place_m, axis=1)
-        order = np.argsort(away)
-        same = self.config.same_m
-        if away[order[0]] > 2.0 * same:
-            return -1, len(mine)
-        doubtful = len(away) > 1 and away[order[1]] < 2.0 * away[order[0]]
-        if away[order[0]] > same or doubtful:
-            return -1, -1
-        return int(mine[order[0]]), 0
-
-    def _meet(self, kind: int, number: int, place_m: np.ndarray, belief: Belief | None) -> int:
-        """Take a landmark into the vocabulary."""
+    def _add(self, kind: int, number: int, place_m: np.ndarray, belief: Belief | None) -> int:
+        """Add a landmark to the vocabulary; return its row."""
         experience, offset = -1, np.zeros(2)
         if belief is not None and belief.experience >= 0:  # on a map that is relaxed
             experience, offset = belief.experience, into_frame(belief.at, place_m)
@@ -462,13 +434,13 @@ class SemanticCells(Population):
             experience=experience,
             offset_m=torch.from_numpy(offset),
         )
-        pointer = _pointer(self.config, kind, number)[None].to(self.slam.pointers)
+        pointer = landmark_pointer(self.config, kind, number)[None].to(self.slam.pointers)
         self.slam.pointers = torch.cat([self.slam.pointers[:row], pointer])
-        self._rows[kind, number] = row
+        self.known.row_of[kind, number] = row
         return row
 
-    def _agreeing(self, rows: np.ndarray, fresh: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-        """Tell which landmarks in sight most others do not contradict."""
+    def _inliers(self, rows: np.ndarray, fresh: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+        """Return which landmarks in sight are inliers."""
         good = rows >= 0
         known = good & ~fresh
         if known.sum() < _CONSENSUS:
@@ -482,11 +454,11 @@ class SemanticCells(Population):
     def _steps(
         self, dt_s: float, step_m: tuple[float, float], rows: np.ndarray, vectors: np.ndarray
     ) -> tuple[int, float, float, bool]:
-        """Let SSP-SLAM live for the time of a frame; returns its last step.
+        """Run SSP-SLAM for the time of a frame.
 
         Returns:
-            Landmark attended to or -1, how strongly it is recalled, how far the gate is open, and
-            whether it is believed against the path.
+            Of the last step: attended landmark or -1, strength of its recall, opening of the gate,
+            and whether the robot is lost.
         """
         slam, now, dt = self.slam, self.now, self.config.time_step_s
         now.owed_s += dt_s
@@ -506,19 +478,20 @@ class SemanticCells(Population):
         low = np.tile(low, (steps, 1, 1, 1))
         view = LandmarkView(in_view, distance, low, low, np.arange(n))
         velocity = torch.tensor(step_m) / (steps * dt)
-        said = slam.run(velocity.expand(steps, 1, 2), view, self.watch)
+        result = slam.run(velocity.expand(steps, 1, 2), view, self.watch)
         recall, gate, lost, attended = (
-            part[-1, 0].item() for part in (said.recall, said.gate, said.lost, said.attended)
+            part[-1, 0].item()
+            for part in (result.recall, result.gate, result.lost, result.attended)
         )
         return attended, recall, gate, lost and bool(slam.familiar[0])
 
     def _note_place(self, row: int, belief: Belief | None, seen_m: np.ndarray) -> None:
-        """Read out where the landmark is that is recalled."""
+        """Decode the recalled position of a landmark into ``known``."""
         recalled = torch.view_as_complex(self.slam.recalled)
         start = self.known["place_m"][row][None].to(recalled.real)
         place = self.decoder.track(recalled, start)
         clear = _CLEAR * float(recalled.abs().square().mean(-1).sqrt())
-        if float(self.decoder.similarity(recalled, place)) < clear:  # first seen where it is not?
+        if float(self.decoder.similarity(recalled, place)) < clear:  # decoded at a side lobe?
             again = torch.from_numpy(seen_m)[None].to(start)
             for _ in range(_STEPS):
                 again = self.decoder.track(recalled, again)
@@ -537,7 +510,7 @@ class SemanticCells(Population):
         .. math:: \theta \leftarrow \theta - \kappa\,\Delta t\;
                   \mathrm{mean}_i\,\angle\bigl(d_i,\, m_i - x\bigr)
 
-        with :math:`d_i` the vector seen and :math:`m_i` where the landmark is recalled to be.
+        with :math:`d_i` the observed vector and :math:`m_i` the recalled position of the landmark.
         """
         known = (kind != VIEW) & (self.known["seen"].numpy()[rows] >= LEAST_SEEN)
         expected = self.known["place_m"].numpy()[rows] - np.array(self.pose[:2])
@@ -550,51 +523,14 @@ class SemanticCells(Population):
         self.now.heading_rad = wrap_angle(self.now.heading_rad + turn)
         return turn
 
-    def _index(self) -> None:
-        kinds, numbers = (self.known[c].tolist() for c in ("kind", "number"))
-        self._rows = {key: i for i, key in enumerate(zip(kinds, numbers, strict=True))}
-
-    @torch.no_grad()
     def merged(self, loaded: State, partial: State, join: Join) -> State:
-        """Join the landmarks of two sessions in the frame of the loaded one, and write them anew.
-
-        Landmarks of one name are one, views as the maps' are, nameless ones where they lie
-        together. One that lies elsewhere now is where the partial session, the younger, saw it.
-        """
-        one, other = (SemanticCells(self.config, follows=self.follows) for _ in range(2))
-        one.load_state_dict(loaded)
-        other.load_state_dict(partial)
-        there = self._moved(other.known["place_m"].numpy(), join)
-        keys = {key: row for row, key in enumerate(one._rows)}
-        columns = {c: one.known[c].tolist() for c in one.known.columns}
-        free = sum(kind == NAMELESS for kind, _ in keys)
-        for row, (kind, number) in enumerate(other._rows):
-            if kind == VIEW:
-                number = int(join.views[number])
-            elif kind == NAMELESS:
-                number, free = _same_nameless(one, there[row], free)
-            theirs = {c: other.known[c][row].tolist() for c in columns}
-            at = keys.get((kind, number))
-            if theirs["experience"] >= 0:
-                theirs["experience"] = int(join.experiences[theirs["experience"]])
-                turn = float(join.turns_rad[other.known["experience"][row]])
-                theirs["offset_m"] = rotated(np.array(theirs["offset_m"]), turn).tolist()
-            if at is None:
-                keys[kind, number] = len(columns["kind"])
-                for c, value in (
-                    theirs | {"number": number, "place_m": there[row].tolist()}
-                ).items():
-                    columns[c].append(value)
-                continue
-            mine = np.array(columns["place_m"][at])
-            agree = np.linalg.norm(mine - there[row]) < self.config.same_m
-            columns["place_m"][at] = ((mine + there[row]) / 2 if agree else there[row]).tolist()
-            columns["seen"][at] += theirs["seen"]
-            columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
-        return self._written(other, columns, join)
+        """Merge the landmarks of two sessions; see :func:`~.semantic_joining.merge_landmarks`."""
+        return merge_landmarks(
+            lambda: SemanticCells(self.config, follows=self.follows), loaded, partial, join
+        )
 
     def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
-        """Say how two maps of landmarks alone lie by those that both know by name."""
+        """Align the frames of two sessions by the named landmarks that both know."""
         if self.follows != "nothing":
             return None
         return shared_frames(loaded, partial, same_m=self.config.same_m)
@@ -602,64 +538,27 @@ class SemanticCells(Population):
     def match(
         self, loaded: Population, maps: tuple[np.ndarray, np.ndarray], config: BrainConfig
     ) -> tuple[Match | None, str]:
-        """Align the landmarks that two sessions know by name."""
+        """Find the alignment of two maps by the named landmarks of both sessions."""
         if not isinstance(loaded, SemanticCells):
-            raise TypeError(f"SemanticCells: cannot be matched with {type(loaded).__name__}")
+            raise TypeError(
+                f"SemanticCells: cannot be matched with {type(loaded).__name__}; "
+                "expected SemanticCells"
+            )
         states = loaded.state_dict(), self.state_dict()
         known = loaded.landmarks(), self.landmarks()
         return match_landmarks(states, known, maps, config)
 
-    def _moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
-        """Bring positions of the partial session, ``(n, 2)``, into the loaded one's frame."""
+    def moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
+        """Move positions of the partial session, ``(n, 2)``, into the loaded frame."""
         if self.follows == "map":
             return join.place(np.column_stack([points_m, np.zeros(len(points_m))]))[:, :2]
         return join.place_cells(points_m)
 
-    def _written(self, session: "SemanticCells", columns: dict[str, list], join: Join) -> State:
-        """Write landmarks into a fresh memory, with which the session goes on."""
-        merged = SemanticCells(self.config, follows=self.follows)
-        dtypes = {c: session.known[c].dtype for c in columns}
-        shape = {c: session.known[c].shape[1:] for c in columns}
-        merged.known.replace(
-            **{
-                c: torch.tensor(v, dtype=dtypes[c]).reshape(-1, *shape[c])
-                for c, v in columns.items()
-            }
-        )
-        merged._index()
-        slam = merged.slam
-        if merged._rows:
-            pointers = torch.stack([_pointer(self.config, *key) for key in merged._rows])
-            slam.pointers = pointers.to(slam.pointers)
-            merged._write()
-        now = self._moved(np.array([session.pose[:2]]), join)[0]
-        slam.time_s = session.slam.time_s.clone()
-        slam.start(torch.tensor(now[None]))
-        for name in session.now.kinds:
-            setattr(merged.now, name, getattr(session.now, name))
-        turn = join.rotation_rad if self.follows == "map" else join.cells_turn_rad
-        merged.now.heading_rad = wrap_angle(session.now.heading_rad + turn)
-        merged.now.told = -1
-        return merged.state_dict()
-
-
-def _same_nameless(one: SemanticCells, place_m: np.ndarray, free: int) -> tuple[int, int]:
-    """Number that a nameless landmark gets in a merge, and the next that is free."""
-    row, _ = one._nearest(place_m)
-    return (int(one.known["number"][row]), free) if row >= 0 else (free, free + 1)
-
-
-def _pointer(config: SemanticConfig, kind: int, number: int) -> Tensor:
-    """Pointer of a landmark: random, of length 1, the same in every session."""
-    draw = torch.Generator().manual_seed((config.seed * 3 + kind) * 1_000_003 + number)
-    vector = torch.randn(config.key_features, generator=draw)
-    return vector / vector.norm()
-
 
 def _take_pointers(
-    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+    cells: SemanticCells, state: dict[str, Tensor], prefix: str, *_unused: object
 ) -> None:
-    """Make room for as many pointers as a state has."""
+    """Resize the pointers to those of a saved state."""
     saved = state.get(f"{prefix}slam.pointers")
     if saved is not None:
-        module.slam.pointers = module.slam.pointers.new_empty(saved.shape)
+        cells.slam.pointers = cells.slam.pointers.new_empty(saved.shape)

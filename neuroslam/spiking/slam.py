@@ -19,8 +19,9 @@ from neuroslam.spiking.ensemble import lowpass, synapse
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
-from neuroslam.spiking.quantise import quantised
+from neuroslam.spiking.quantise import on_chip, quantised
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
 from neuroslam.worlds.landmarks import LandmarkView
 
@@ -28,7 +29,6 @@ _CHUNK = 200  # steps whose inputs are prepared at once
 _GATE_WIDTH = 0.02  # of similarity, over which the gate opens
 _KNOWN = 0.5  # strength of a recall from which a landmark counts as known
 _SETTLED_S = 0.15  # of a landmark, before neurons say it and its place is learnt
-_TUNED_TO_KEYS = 20.0  # power of rates to a key, of neurons tuned to it over others
 _AREA_INTERCEPT = 0.05  # similarity at which cells of the memory of places fire
 _CONTRADICTS, _AGREES = 0.5, 0.7  # of similarity; side lobes of a space are below the first
 _LOST_GAIN = 1.0  # of what the map says, to one who is lost
@@ -202,7 +202,7 @@ class SSPSLAM(BufferModule):
         Raises:
             SpaceError: If anything does not fit or is not a number; nothing has changed then.
         """
-        velocity, sight = self._inputs(velocity_m_s.unsqueeze(0), _with_time(view))
+        velocity, sight = self._inputs(velocity_m_s.unsqueeze(0), with_time(view))
         return self._step(velocity[0], *(part[0] for part in sight))
 
     @torch.inference_mode()
@@ -227,7 +227,7 @@ class SSPSLAM(BufferModule):
         said = []
         for begin in range(0, len(velocity_m_s), _CHUNK):
             part = slice(begin, begin + _CHUNK)
-            velocity, sight = self._inputs(velocity_m_s[part], _cut(view, part))
+            velocity, sight = self._inputs(velocity_m_s[part], cut(view, part))
             for k, v in enumerate(velocity):
                 step = self._step(v, *(p[k] for p in sight))
                 if watch is not None:
@@ -368,7 +368,7 @@ class SSPSLAM(BufferModule):
         for part in (low, high):
             if not bool(torch.isfinite(part[in_view[..., view.box_landmark]]).all()):
                 raise SpaceError("SSPSLAM: the place of a landmark in view is not a number")
-        boxes, weight = _boxes_of(view, n)
+        boxes, weight = boxes_of(view, n)
         boxes, weight = boxes.to(kind.device), weight.to(kind)
         if c.attention == "sum":
             z = region_vectors(self.space, low[..., boxes, :], high[..., boxes, :], weight)
@@ -400,60 +400,3 @@ class SSPSLAM(BufferModule):
                 f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
             )
         return position
-
-
-def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
-    """Leave out what a chip cannot do: all that is a function outside of neurons."""
-    if config.tier != "spiking":
-        raise SpaceError(
-            f"SSPSLAM: quantised neurons spike, but the tier is {config.tier!r}; set tier to "
-            "'spiking'"
-        )
-    return config.model_copy(
-        update={
-            "neurons": config.neurons.model_copy(update={"model": "stepped_lif"}),
-            "integrator": config.integrator.model_copy(update={"coupling": "none"}),
-            "map": config.map.model_copy(
-                update={
-                    "voja_rate": 0.0,
-                    "plasticity": "constant",
-                    "pes_rate": config.map.pes_rate / _TUNED_TO_KEYS,
-                }
-            ),
-            "binding": "neurons",
-            "vector_neurons": config.vector_neurons or config.map.neurons,
-            "relocalise_after_s": 0.0,
-        }
-    )
-
-
-def _boxes_of(view: LandmarkView, n_landmarks: int) -> tuple[Tensor, Tensor]:
-    """Boxes of each landmark, ``(landmarks, most boxes)``, and their shares by size."""
-    owner = np.asarray(view.box_landmark)
-    if np.array_equal(owner, np.arange(n_landmarks)):
-        boxes = torch.arange(n_landmarks).unsqueeze(-1)
-        return boxes, torch.ones(boxes.shape, dtype=torch.float64)
-    size = np.asarray(view.high_m)[0, 0] - np.asarray(view.low_m)[0, 0]
-    measure = np.where(size > 0, size, 1.0).prod(-1)
-    most = max(1, int(np.bincount(owner, minlength=n_landmarks).max()))
-    boxes, weight = np.zeros((n_landmarks, most), dtype=np.int64), np.zeros((n_landmarks, most))
-    for landmark in range(n_landmarks):
-        own = np.flatnonzero(owner == landmark)
-        boxes[landmark, : len(own)], weight[landmark, : len(own)] = own, measure[own]
-    return torch.from_numpy(boxes), torch.from_numpy(
-        weight / weight.sum(-1, keepdims=True).clip(1e-12)
-    )
-
-
-def _with_time(view: LandmarkView | None) -> LandmarkView | None:
-    return None if view is None else _each(view, lambda a: np.asarray(a)[None])
-
-
-def _cut(view: LandmarkView | None, part: slice) -> LandmarkView | None:
-    return None if view is None else _each(view, lambda a: a[part])
-
-
-def _each(view: LandmarkView, change: Callable[[np.ndarray], np.ndarray]) -> LandmarkView:
-    """Change what leads with time; whose boxes they are stays."""
-    changed = {f: change(getattr(view, f)) for f in view._fields if f != "box_landmark"}
-    return view._replace(**changed)

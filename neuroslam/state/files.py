@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, uint8
 
-from neuroslam.errors import CheckpointError
+from neuroslam.errors import CheckpointError, first_line
 
 _KEY = "neuroslam"  # one metadata key: safetensors does not keep the order of several
 
@@ -50,7 +50,7 @@ def tensors_digest(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         tensor = tensors[name].contiguous().cpu()
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
-        digest.update(tensor.reshape(-1).view(uint8).numpy() if tensor.numel() else b"")
+        digest.update(tensor.reshape(-1).view(uint8).numpy().data if tensor.numel() else b"")
     return digest.hexdigest()
 
 
@@ -116,12 +116,6 @@ def load_checked(
             "restore it from a copy"
         )
     return about, tensors
-
-
-def first_line(error: Exception) -> str:
-    """Return the line of a long error that says what is wrong."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[1] if len(lines) > 1 and lines[0].endswith(":") else (lines or ["?"])[0]
 
 
 def _say_if_a_pickle(path: Path, kind: str) -> None:

@@ -28,7 +28,7 @@ class Pairs(NamedTuple):
         table = np.array(rows, dtype=np.float64).reshape(-1, 4)
         return cls(*table[:, :2].T.astype(np.int64), *table[:, 2:].T)
 
-    def pick(self, which: np.ndarray) -> Self:
+    def pick(self, which: np.ndarray | list[int] | slice) -> Self:
         """Return some of them, by number or by truth."""
         return type(self)(*(column[which] for column in self))
 

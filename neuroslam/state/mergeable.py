@@ -1,9 +1,9 @@
 """Modules whose state is saved and merged, and rules by which two states become one."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import ClassVar, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from neuroslam.state.join import Join
 
 P = ParamSpec("P")
 T = TypeVar("T")
+M = TypeVar("M", bound=nn.Module)
 
 State = dict[str, Tensor]
 """A ``state_dict``, or the part of one that belongs to a module, without its prefix."""
@@ -35,7 +36,7 @@ class BufferModule(nn.Module):
         super().__init__()
         self.register_load_state_dict_pre_hook(_make_room)
 
-    def __setattr__(self, name: str, value: object) -> None:
+    def __setattr__(self, name: str, value: Any) -> None:  # noqa: ANN401
         """Replace a buffer at once: torch checks it anew each time, which costs more than a step.
 
         Anything else is left to torch.
@@ -45,6 +46,22 @@ class BufferModule(nn.Module):
             buffers[name] = value
         else:
             super().__setattr__(name, value)
+
+
+class ModulesOf(nn.ModuleList, Generic[M]):
+    """A list of modules of one class, for readers and type checkers."""
+
+    if TYPE_CHECKING:
+
+        def __iter__(self) -> Iterator[M]: ...
+
+        @overload
+        def __getitem__(self, idx: int) -> M: ...
+
+        @overload
+        def __getitem__(self, idx: slice) -> "ModulesOf[M]": ...
+
+        def __getitem__(self, idx: int | slice) -> "M | ModulesOf[M]": ...
 
 
 class Mergeable(BufferModule, ABC):
@@ -151,12 +168,30 @@ def _summed_rows(loaded: Tensor, partial: Tensor, ids: np.ndarray) -> Tensor:
 def rows_of_views(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
     """Keep the loaded rows, then those of partial views that are new; a row for each view.
 
+    Raises:
+        MapError: If a table has more or fewer rows than its session has views.
+
     Example:
         >>> join = Join.nothing()._replace(views=np.array([0, 2]), n_views=2)
         >>> rows_of_views(torch.tensor([5, 6]), torch.tensor([1, 3]), join).tolist()
         [5, 6, 3]
     """
-    return torch.cat([loaded, partial[torch.from_numpy(join.kept_views)].to(loaded)])
+    return _kept_rows(loaded, partial, join.views, join.n_views, "view")
+
+
+def rows_of_experiences(loaded: Tensor, partial: Tensor, join: Join) -> Tensor:
+    """Keep the loaded rows, then those of partial experiences that are new; one for each."""
+    return _kept_rows(loaded, partial, join.experiences, join.n_experiences, "experience")
+
+
+def _kept_rows(loaded: Tensor, partial: Tensor, ids: np.ndarray, n: int, what: str) -> Tensor:
+    for whose, table, expected in (("loaded", loaded, n), ("partial", partial, len(ids))):
+        if len(table) != expected:  # rows would go to others than they were learnt of
+            raise MapError(
+                f"merge: the {whose} table has {len(table)} rows, expected one for each of "
+                f"{expected} {what}s"
+            )
+    return torch.cat([loaded, partial[torch.from_numpy(np.flatnonzero(ids >= n))].to(loaded)])
 
 
 def renamed(number: Tensor, ids: np.ndarray) -> Tensor:

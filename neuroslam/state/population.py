@@ -6,8 +6,8 @@ the map closes a loop), ``follow`` (what others correct), ``learn`` and ``recall
 population leads: it decides which experience of the map the robot is at.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
 
 import numpy as np
 
@@ -136,7 +136,8 @@ class Belief(NamedTuple):
     @property
     def at(self) -> np.ndarray:
         """Pose of the experience that the robot is at, ``(3,)``."""
-        return self.poses[self.experience]
+        pose: np.ndarray = self.poses[self.experience]
+        return pose
 
 
 class Decision(NamedTuple):
@@ -189,7 +190,8 @@ class Population(Mergeable):
             config: Of the brain.
             leader: Class of the population that leads it.
         """
-        return cls(config.section(cls.kind)) if cls.config_section else cls()
+        make = cast(Callable[..., Self], cls)  # a subclass takes its section of the config
+        return make(config.section(cls.kind)) if cls.config_section else make()
 
     # --- a frame -------------------------------------------------------------------------------
 
@@ -325,25 +327,31 @@ class LeadableMap(Protocol):
     @property
     def n(self) -> int:
         """Number of experiences."""
+        ...
 
     @property
     def current(self) -> int:
         """Id of the experience the robot is at, -1 before the first."""
+        ...
 
     @property
     def pose(self) -> Pose:
         """Pose of the robot."""
+        ...
 
     @property
     def pose_table(self) -> np.ndarray:
         """Poses of all experiences, ``(n, 3)``, to read only."""
+        ...
 
     def visit(
         self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None
     ) -> tuple[Action, int]:
         """Go to an experience by position."""
+        ...
 
     def __call__(
         self, motion: Motion, view: ViewMatch, cells: PoseEstimate, frame: int, *, kidnapped: bool
     ) -> tuple[Action, int]:
         """Integrate odometry, and go to an experience by view."""
+        ...

@@ -68,7 +68,7 @@ def session_id(*parts: object) -> int:
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype}{part.shape}".encode())
-            digest.update(np.ascontiguousarray(part))
+            digest.update(np.ascontiguousarray(part).data)
         else:
             digest.update(repr(part).encode())
         digest.update(b";")
@@ -80,6 +80,8 @@ class SessionLog(Mergeable):
 
     State is text, JSON in bytes: names and reports are no numbers.
     """
+
+    text: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,8 +107,7 @@ class SessionLog(Mergeable):
             session = before.get(session, 0)
         return drive
 
-    @staticmethod
-    def merged(loaded: State, partial: State, _join: Join) -> State:
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Keep the loaded sessions, then the partial ones that it does not have; so the merges."""
         one, other = _parse(loaded["text"]), _parse(partial["text"])
         last = other["sessions"][-1]["id"] if other["sessions"] else None
@@ -145,7 +146,8 @@ def _as_bytes(about: dict[str, Any]) -> Tensor:
 def _parse(text: Tensor) -> dict[str, Any]:
     if not len(text):
         return {"sessions": [], "merges": [], "refusals": []}
-    return json.loads(bytes(text.tolist()))
+    about: dict[str, Any] = json.loads(bytes(text.tolist()))
+    return about
 
 
 def _take_length(

@@ -1,5 +1,8 @@
 """State that grows or changes every frame: tables of rows, and named numbers."""
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
 import torch
 from torch import Tensor, nn
 
@@ -21,7 +24,10 @@ class GrowingTable(nn.Module):
         [0.5, 1.5]
     """
 
-    def __init__(self, columns: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> None:
+    columns: tuple[str, ...]
+    n: int
+
+    def __init__(self, columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]]) -> None:
         super().__init__()
         self.n = 0
         self.columns = tuple(columns)
@@ -30,19 +36,19 @@ class GrowingTable(nn.Module):
         self.register_load_state_dict_pre_hook(_resize_to_saved)
         self.register_state_dict_post_hook(_keep_used_part)
 
-    def append(self, **row: object) -> int:
+    def append(self, **row: float | Tensor) -> int:
         """Add one row, a value for every column, and return its number."""
-        if self.n == self._buffers[self.columns[0]].shape[0]:
+        if self.n == self._column(self.columns[0]).shape[0]:
             self.reserve(max(16, 2 * self.n))
         for name in self.columns:
-            self._buffers[name][self.n] = row[name]
+            self._column(name)[self.n] = row[name]
         self.n += 1
         return self.n - 1
 
     def reserve(self, capacity: int) -> None:
         """Make room for ``capacity`` rows; the rows in use stay."""
         for name in self.columns:
-            old = self._buffers[name]
+            old = self._column(name)
             new = old.new_zeros((capacity, *old.shape[1:]))
             new[: self.n] = old[: self.n]
             self._buffers[name] = new
@@ -57,13 +63,13 @@ class GrowingTable(nn.Module):
         if len(lengths) != 1:
             raise ValueError(f"GrowingTable: columns of different lengths {sorted(lengths)}")
         for name, value in columns.items():
-            old = self._buffers[name]
+            old = self._column(name)
             self._buffers[name] = value.to(old).reshape((-1, *old.shape[1:])).clone()
         self.n = lengths.pop()
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the used part of a column, a view: writing to it changes the table."""
-        return self._buffers[name][: self.n]
+        return self._column(name)[: self.n]
 
     def __len__(self) -> int:
         """Return the number of rows in use."""
@@ -73,21 +79,25 @@ class GrowingTable(nn.Module):
         """Return True, for an empty table is a table too."""
         return True
 
+    def _column(self, name: str) -> Tensor:
+        """Return a column with its spare rows; torch allows ``None``, a table does not."""
+        return cast(Tensor, self._buffers[name])
+
 
 def _resize_to_saved(
-    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
+    module: GrowingTable, state: dict[str, Tensor], prefix: str, *_unused: object
 ) -> None:
     for name in module.columns:
         saved = state.get(prefix + name)
         if saved is not None:
-            old = module._buffers[name]
+            old = module._column(name)
             if saved.shape[1:] == old.shape[1:]:  # another entry shape is left for torch to refuse
                 module._buffers[name] = old.new_empty(saved.shape)
                 module.n = saved.shape[0]
 
 
 def _keep_used_part(
-    module: nn.Module, state: dict[str, Tensor], prefix: str, _metadata: object
+    module: GrowingTable, state: dict[str, Tensor], prefix: str, _metadata: object
 ) -> None:
     for name in module.columns:
         state[prefix + name] = state[prefix + name][: module.n]
@@ -96,7 +106,8 @@ def _keep_used_part(
 class Scalars(nn.Module):
     """Named numbers that change every frame: Python numbers in use, 0-d tensors in ``state_dict``.
 
-    A tensor operation on a single number costs microseconds; a Python one does not.
+    A tensor operation on a single number costs microseconds; a Python one does not. A subclass may
+    declare the names and their types, for readers and type checkers.
 
     Raises:
         ValueError: If a name would hide one of ``nn.Module``.
@@ -107,6 +118,14 @@ class Scalars(nn.Module):
         >>> {name: value.item() for name, value in state.state_dict().items()}
         {'frame': 1, 'heading_rad': 0.5}
     """
+
+    kinds: dict[str, type[float]]
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+            """Have numbers that no subclass declares: to a type checker they would be modules."""
+            ...
 
     def __init__(self, **values: float) -> None:
         super().__init__()
@@ -119,7 +138,7 @@ class Scalars(nn.Module):
         self.register_state_dict_post_hook(_write_scalars)
         self.register_load_state_dict_pre_hook(_read_scalars)
 
-    def __setattr__(self, name: str, value: object) -> None:
+    def __setattr__(self, name: str, value: Any) -> None:  # noqa: ANN401
         """Set a number the short way: nn.Module takes microseconds to see that it is no tensor."""
         if name in self.__dict__.get("kinds", ()):
             self.__dict__[name] = value
@@ -128,7 +147,7 @@ class Scalars(nn.Module):
 
 
 def _write_scalars(
-    module: nn.Module, state: dict[str, Tensor], prefix: str, _metadata: object
+    module: Scalars, state: dict[str, Tensor], prefix: str, _metadata: object
 ) -> None:
     for name, kind in module.kinds.items():
         dtype = torch.int64 if kind is int else torch.float64
@@ -136,7 +155,7 @@ def _write_scalars(
 
 
 def _read_scalars(
-    module: nn.Module,
+    module: Scalars,
     state: dict[str, Tensor],
     prefix: str,
     _metadata: object,

@@ -1,4 +1,4 @@
-"""Recognising places by what they look like."""
+"""Local view cells: recognition of familiar views by template matching."""
 
 from neuroslam.view.templates import LocalViewCells
 

@@ -1,4 +1,4 @@
-"""From a picture to a template: grey, crop, block mean, mean and patch normalisation."""
+"""Makes templates of images: grey, crop, block mean, mean and patch normalisation."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -8,15 +8,15 @@ import numpy as np
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError
-from neuroslam.sensors.frames import check_picture
+from neuroslam.sensors.frames import check_image
 
 
 class Encoded(NamedTuple):
-    """A picture as a template.
+    """Template of an image.
 
     Attributes:
         template: Grey in [0, 1], ``float64``, shape ``(template_height, template_width)``.
-        contrast: Standard deviation of the grey view before it was normalised.
+        contrast: Standard deviation of the grey view before normalisation.
     """
 
     template: np.ndarray
@@ -24,25 +24,25 @@ class Encoded(NamedTuple):
 
 
 def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
-    """Make the template of a picture.
+    """Make the template of an image.
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-        config: Crop, size and normalisations.
+        config: Crop, size and normalisation.
 
     Raises:
-        BadFrame: If the picture is of another type or shape.
-        ConfigError: If the crop leaves the picture, or is smaller than the template.
+        BadFrame: If the image has another type or shape.
+        ConfigError: If the crop exceeds the image, or is smaller than the template.
 
     Example:
-        >>> picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
+        >>> image = np.arange(48, dtype=np.uint8).reshape(6, 8)
         >>> config = ViewConfig(
         ...     template_width=4, template_height=3, shift_match=1, normalisation=0
         ... )
-        >>> (encode(picture, config).template[0] * 255).tolist()
+        >>> (encode(image, config).template[0] * 255).tolist()
         [4.5, 6.5, 8.5, 10.5]
     """
-    check_picture(image, "LocalViewCells")
+    check_image(image, "LocalViewCells")
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
@@ -55,10 +55,10 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
 
 
 def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:
-    """Cut ``x_min, x_max, y_min, y_max`` out of a picture; ``None`` takes all of it.
+    """Crop an image to ``x_min, x_max, y_min, y_max``; ``None`` keeps all of it.
 
     Raises:
-        ConfigError: If the region leaves the picture.
+        ConfigError: If the region exceeds the image.
     """
     if region is None:
         return image
@@ -66,44 +66,44 @@ def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndar
     height, width = image.shape[:2]
     if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
         raise ConfigError(
-            f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the picture "
-            f"of {width}x{height} px; change it, or leave it out to take the whole picture"
+            f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the image "
+            f"of {width}x{height} px; change it, or leave it out to use the whole image"
         )
     return image[y_min:y_max, x_min:x_max]
 
 
 def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Shrink to ``(height, width)`` by the mean of whole blocks; a remainder is left out.
+    """Shrink an image to ``(height, width)`` by the mean of whole blocks, without the remainder.
 
-    Sums are of integers, so they are exact; each is divided once.
+    The sums are of integers, so they are exact; each is divided once.
 
     Raises:
-        ConfigError: If the picture is smaller than that.
+        ConfigError: If the image is smaller than the result.
     """
     h, w = image.shape
     block_h, block_w = h // height, w // width
     if not block_h or not block_w:
         raise ConfigError(
             f"view.template_width x template_height = {width}x{height} is larger than the "
-            f"cropped picture of {w}x{h} px; make the template smaller or the crop larger"
+            f"cropped image of {w}x{h} px; make the template smaller or the crop larger"
         )
     blocks = image[: height * block_h, : width * block_w].reshape(height, block_h, -1)
     rows = np.add.reduce(blocks, axis=1, dtype=np.uint32)
-    sums = rows[:, ::block_w].copy()  # adding columns is quicker than reducing a short axis
+    sums = rows[:, ::block_w].copy()  # adding columns is faster than reducing a short axis
     for column in range(1, block_w):
         sums += rows[:, column::block_w]
-    return sums / (255.0 * block_h * block_w)
+    return np.asarray(sums / (255.0 * block_h * block_w))
 
 
 def normalise_mean(view: np.ndarray, mean: float) -> np.ndarray:
-    """Scale grey to a mean, and clip to [0, 1]; a black view stays black.
+    """Scale grey to a given mean, and clip to [0, 1]; a black view stays black.
 
     Example:
         >>> normalise_mean(np.array([[0.1, 0.3]]), 0.5).round(6).tolist()
         [[0.25, 0.75]]
     """
-    now = view.mean()
-    return np.clip(view * mean / now, 0.0, 1.0) if now > 0.0 else view
+    present = view.mean()
+    return np.clip(view * mean / present, 0.0, 1.0) if present > 0.0 else view
 
 
 def normalise_patches(view: np.ndarray, radius: int, min_std: float) -> np.ndarray:
@@ -111,23 +111,23 @@ def normalise_patches(view: np.ndarray, radius: int, min_std: float) -> np.ndarr
 
     .. math:: z = (x - \mu) / \sigma, \qquad v = \operatorname{clip}((z + 3) / 6,\, 0,\, 1)
 
-    with the mean and deviation of the pixels within ``radius`` that lie in the view.
+    with the mean and standard deviation of the pixels of the view within ``radius``.
 
     Args:
         view: Grey in [0, 1].
         radius: Half width of a patch, px.
-        min_std: Flatter patches become 0.5.
+        min_std: Patches with a smaller standard deviation become 0.5.
     """
-    share = _patch_share(view.shape, radius)
-    apart = view - view.mean()  # deviations are small differences: take them near zero
-    mean = _patch_sums(apart, radius) * share
-    variance = _patch_sums(apart * apart, radius) * share - mean * mean
+    weight = _patch_weights(view.shape[:2], radius)
+    centred = view - view.mean()  # near zero, so that the variance loses no digits
+    mean = _patch_sums(centred, radius) * weight
+    variance = _patch_sums(centred * centred, radius) * weight - mean * mean
     std = np.sqrt(np.maximum(variance, 0.0))
     flat = std <= max(min_std, 1e-6)
     std[flat] = 1.0
-    found = np.clip((apart - mean) / (6.0 * std) + 0.5, 0.0, 1.0)
-    found[flat] = 0.5
-    return found
+    normalised = np.clip((centred - mean) / (6.0 * std) + 0.5, 0.0, 1.0)
+    normalised[flat] = 0.5
+    return np.asarray(normalised)
 
 
 def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:
@@ -136,6 +136,6 @@ def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _patch_share(shape: tuple[int, int], radius: int) -> np.ndarray:
-    """One over the number of pixels of each patch that lie in the view."""
+def _patch_weights(shape: tuple[int, int], radius: int) -> np.ndarray:
+    """Return one over the number of pixels of each patch that lie in the view."""
     return 1.0 / _patch_sums(np.ones(shape), radius)

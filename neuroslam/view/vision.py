@@ -1,8 +1,9 @@
-"""The only door to torchvision: names ``make_grid``, ``transforms`` (its v2), function ``load``.
+"""Loads torchvision on first use: ``make_grid``, ``transforms`` (its v2) and ``load()``.
 
-Nothing is imported before the first use, as torchvision takes seconds. Beside a CPU-only torch the
-compiled operators of a torchvision built for a GPU do not load, and its import fails with "operator
-torchvision::nms does not exist"; it asks for the mere schemas of two operators that we never call.
+The import takes seconds, so it is delayed to the first use. With a CPU-only torch, the compiled
+operators of a torchvision built for a GPU do not load, and its import fails with "operator
+torchvision::nms does not exist". It only needs the schemas of two operators, which neuroslam never
+calls, so :func:`load` defines them.
 """
 
 import importlib
@@ -22,7 +23,7 @@ _SCHEMA = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
 
 
 def load() -> ModuleType:
-    """Import torchvision, whatever build it is, and return it.
+    """Import torchvision of any build, and return it.
 
     Example:
         >>> load().__name__
@@ -30,7 +31,7 @@ def load() -> ModuleType:
     """
     if "torchvision" in sys.modules:
         return sys.modules["torchvision"]
-    _forget_failed_import()  # a bare import that failed before leaves parts that break the next
+    _forget_failed_import()  # its remains would break the next import
     try:
         return importlib.import_module("torchvision")
     except RuntimeError as error:
@@ -44,12 +45,13 @@ def load() -> ModuleType:
 
 
 def _forget_failed_import() -> None:
+    """Remove the submodules that a failed import has left."""
     for name in [name for name in sys.modules if name.startswith("torchvision.")]:
         del sys.modules[name]
 
 
 def __getattr__(name: str) -> object:
-    """Import torchvision when one of its names is asked for, and keep the name (PEP 562)."""
+    """Import torchvision on the first access to one of its names, and store the name (PEP 562)."""
     if name not in ("make_grid", "transforms"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     load()

@@ -1,1 +1,1 @@
-"""Worlds that are made: rendered ones, arenas with walks in them, landmarks to be seen."""
+"""Worlds to drive through: rendered worlds, arenas, and worlds of landmarks."""

@@ -1,6 +1,6 @@
-"""Arenas seen from above: where their walls are, from any position in them.
+"""Arenas seen from above, and their walls as sensed from positions in them.
 
-An outline is ``(n, 2)`` vertices in metres in either sense, not repeating the first, or the three
+An outline is ``(n, 2)`` vertices in metres in either sense, the first not repeated, or the three
 numbers ``(x, y, radius)`` of a circle.
 """
 
@@ -26,14 +26,14 @@ from neuroslam.worlds.outlines import (
     within,
 )
 
-_CHUNK = 25_600  # numbers in a temporary: what a core keeps close to itself
+_CHUNK = 25_600  # numbers in a temporary array, so that it stays in the cache of a core
 
 
 class _Blockers(NamedTuple):
-    """What may stand before one face of a wall, in its frame: t along it from the middle, s off it.
+    """Obstacles before one face of a wall, in its frame: t along it from the middle, s off it.
 
     Attributes:
-        segments: ``(m, 4)``: t at both ends, the lower first; s at t = 0; slope of s.
+        segments: ``(m, 4)``: lower and upper t; s at t = 0; slope of s.
         circles: ``(m, 3)``: t and s of the centre, radius.
     """
 
@@ -41,39 +41,39 @@ class _Blockers(NamedTuple):
     circles: np.ndarray
 
     def hide(self, t: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Tell for which positions ``(n,)`` something stands between them and their foot."""
+        """Return which positions ``(n,)`` have an obstacle between them and their foot."""
         if not len(self.segments) + len(self.circles):
             return np.zeros(len(t), dtype=bool)
         t, s = t[:, None], s[:, None]
         low, high, base, slope = self.segments.T
-        there = base + slope * t
+        at = base + slope * t
         hidden = (t >= low - TOUCH_M) & (t <= high + TOUCH_M)
-        hidden &= (there > TOUCH_M) & (there < s - TOUCH_M)
+        hidden &= (at > TOUCH_M) & (at < s - TOUCH_M)
         along, off, radius = self.circles.T
         depth = radius**2 - (t - along) ** 2
-        there = off - np.sqrt(np.maximum(depth, 0.0))
-        behind = (depth > 0.0) & (there > TOUCH_M) & (there < s - TOUCH_M)
-        return hidden.any(axis=1) | behind.any(axis=1)
+        at = off - np.sqrt(np.maximum(depth, 0.0))
+        behind = (depth > 0.0) & (at > TOUCH_M) & (at < s - TOUCH_M)
+        return np.asarray(hidden.any(axis=1) | behind.any(axis=1))
 
 
 class Arena:
-    """An environment: one outer boundary, holes in it, and walls that stand free.
+    """An environment: one outer boundary, holes in it, and free-standing walls.
 
     The walls are numbered: sides of the boundary, sides of the holes, free-standing walls, then the
     circles, the boundary first. Corners are no walls. Positions should be inside, see
-    :meth:`check_inside`; one that is NaN sees nothing.
+    :meth:`check_inside`; from a position of NaN no wall is visible.
 
     Args:
         vertices: The boundary, an outline.
-        holes: Outlines of what nobody can walk on; a circular one is a pillar.
-        walls: Two ends ``(2, 2)`` of each free-standing wall, seen from both sides. They may touch
-            the boundary and each other.
-        name: For messages.
+        holes: Outlines of areas that cannot be entered; a circular one is a pillar.
+        walls: Two ends ``(2, 2)`` of each free-standing wall, which is visible from both sides.
+            They may touch the boundary and each other.
+        name: Name for messages.
 
     Raises:
-        SourceError: If an outline has fewer than three vertices, a side without length, crosses
-            itself, or holds NaN; if a radius is not above zero; if a hole or a wall touches what it
-            must not, or lies outside.
+        SourceError: If an outline has fewer than three vertices, a side of length 0, crosses
+            itself, or contains NaN; if a radius is not positive; if a hole or a wall crosses the
+            boundary or another one, or lies outside.
 
     Example:
         >>> square = Arena([(0, 0), (1, 0), (1, 1), (0, 1)])
@@ -110,7 +110,7 @@ class Arena:
         circles = [outline for outline in (self.boundary, *self.holes) if outline.ndim == 1]
         self._circles = np.array(circles).reshape(-1, 3)
         self._origin = self._circles[0, :2] if self._round else self.boundary.mean(axis=0)
-        # One product gives s, the distance off each wall, and another t, in half lengths along it.
+        # One matrix product gives s, the distance off each wall; one t, in half lengths along it.
         at = self._middle - self._origin
         self._off = self._normal.T.copy(), np.sum(at * self._normal, axis=1)
         unit = self._along / self._half[:, None]
@@ -122,12 +122,12 @@ class Arena:
     def circle(
         cls, radius_m: float, centre: tuple[float, float] = (0.0, 0.0), name: str = "circle"
     ) -> Self:
-        """Make a round arena, which has one wall."""
+        """Make a circular arena, which has one wall."""
         return cls((*centre, radius_m), name=name)
 
     @classmethod
     def regular(cls, n_sides: int, radius_m: float, name: str = "polygon") -> Self:
-        """Make a regular polygon about the origin; its first corner is straight up (north).
+        """Make a regular polygon around the origin; its first corner is at +y.
 
         Example:
             >>> Arena.regular(4, 1.0).boundary.round(6).tolist()
@@ -145,7 +145,7 @@ class Arena:
         door_m: float = 0.3,
         name: str = "rooms",
     ) -> Self:
-        """Make rooms in a row along x, about the origin, with a door in the middle of each wall.
+        """Make a row of rooms along x, around the origin, with a door in the middle of each wall.
 
         Raises:
             SourceError: If there is no room, or the door is not narrower than the wall.
@@ -166,12 +166,12 @@ class Arena:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], name: str = "arena") -> Self:
-        """Read what :meth:`to_arrays` made, or a recording's ``vertices`` or ``arena_radius``.
+        """Make an arena from the arrays of :meth:`to_arrays`, or of a recording.
 
-        Other arrays are not read.
+        A recording has ``vertices`` or ``arena_radius``; other arrays are ignored.
 
         Raises:
-            SourceError: If there is neither, or they are no arena.
+            SourceError: If there is neither, or they describe no arena.
 
         Example:
             >>> Arena.from_arrays({"arena_radius": np.array(0.5)}).bounds
@@ -195,10 +195,10 @@ class Arena:
         return cls(boundary, holes, list(arrays["walls"]) if "walls" in arrays else (), name)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return plain arrays for an ``.npz``; :meth:`from_arrays` reads them.
+        """Return arrays for an ``.npz``, the input of :meth:`from_arrays`.
 
-        ``vertices`` or ``arena_radius`` and ``arena_centre``; where there are any:
-        ``hole_vertices`` of all holes with ``hole_sizes``, ``pillars`` ``(m, 3)``, ``walls``
+        Always ``vertices``, or ``arena_radius`` and ``arena_centre``; if there are any,
+        ``hole_vertices`` of all holes with ``hole_sizes``, ``pillars`` ``(m, 3)`` and ``walls``
         ``(m, 2, 2)``.
         """
         polygons = [hole for hole in self.holes if hole.ndim == 2]
@@ -218,12 +218,12 @@ class Arena:
 
     @property
     def n_walls(self) -> int:
-        """How many walls there are, W."""
+        """Number of walls, W."""
         return len(self._half) + len(self._circles)
 
     @cached_property
     def is_convex(self) -> bool:
-        """Whether every wall is seen from everywhere: a convex boundary and nothing in it."""
+        """Whether each wall is visible from everywhere: a convex boundary without obstacles."""
         if self.holes or len(self.walls):
             return False
         turn = cross(self._along, np.roll(self._along, -1, 0))
@@ -240,27 +240,27 @@ class Arena:
 
     @property
     def outlines(self) -> list[np.ndarray]:
-        """Lines to draw, ``(n, 2)``: boundary, holes, walls; closed, circles of 180 points."""
+        """Polylines to draw, ``(n, 2)``: closed boundary and holes, then walls."""
         closed = [vertices_of(outline) for outline in (self.boundary, *self.holes)]
         return [np.vstack([line, line[:1]]) for line in closed] + list(self.walls)
 
     def contains(self, positions: ArrayLike) -> np.ndarray:
-        """Tell which positions ``(n, 2)`` are inside, ``(n,)`` bool; at a wall is inside."""
+        """Return which positions ``(n, 2)`` are inside or at a wall, ``(n,)`` bool."""
         points = self._points(positions)
         inside = np.empty(len(points), dtype=bool)
         for rows in self._chunks(len(points)):
             inside[rows] = within(points[rows], self.boundary)
             for hole in self.holes:
                 inside[rows] &= ~within(points[rows], hole)
-        unsure = np.flatnonzero(~inside)
-        inside[unsure] = self._clearance(points[unsure], self._n_sides) <= TOUCH_M
+        outside = np.flatnonzero(~inside)
+        inside[outside] = self._clearance(points[outside], self._n_sides) <= TOUCH_M
         return inside
 
     def check_inside(self, positions: ArrayLike) -> None:
-        """Do nothing if all positions are inside.
+        """Check that all positions are inside.
 
         Raises:
-            SourceError: Naming the first that is not.
+            SourceError: If one is outside; the message gives the first.
         """
         outside = np.flatnonzero(~self.contains(positions))
         if len(outside):
@@ -271,7 +271,7 @@ class Arena:
             )
 
     def clearance(self, positions: ArrayLike) -> np.ndarray:
-        """Measure from positions ``(n, 2)`` to the nearest point of any wall, in m, ``(n,)``."""
+        """Return the distance of positions ``(n, 2)`` to the nearest wall in metres, ``(n,)``."""
         return self._clearance(self._points(positions), len(self._half))
 
     def _clearance(self, points: np.ndarray, n_straight: int) -> np.ndarray:
@@ -284,22 +284,22 @@ class Arena:
         return nearest
 
     def walls_near(self, positions: ArrayLike, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Find the foot of the perpendicular on every wall that is in reach and in sight.
+        """Find the foot of the perpendicular on every wall that is in reach and visible.
 
-        A wall is not seen if the foot lies beyond its ends, from its back (free-standing ones have
-        none), or if another wall stands before the foot. A circle is one wall, at its nearest
+        A wall is not visible if the foot lies beyond its ends, from behind (free-standing walls
+        have two faces), or if another wall hides the foot. A circle is one wall, at its nearest
         point.
 
         Args:
             positions: In metres, ``(n, 2)``.
-            reach_m: Only walls so near; may be ``inf``.
+            reach_m: Largest distance of a wall; may be ``inf``.
 
         Returns:
-            Distance in metres, ``(n, W)``, ``inf`` where the wall is not seen, and bearing in the
-            world in (-pi, pi], 0 where it is not seen.
+            Distance in metres, ``(n, W)``, ``inf`` if the wall is not visible, and bearing in the
+            world in (-pi, pi], 0 if it is not visible.
 
         Raises:
-            SourceError: If the shapes are wrong or the reach is not above zero.
+            SourceError: If the shapes are wrong or the reach is not positive.
 
         Example:
             >>> distance_m, bearing_rad = Arena.circle(1.0).walls_near([(0.0, 0.75)], 0.3)
@@ -314,27 +314,27 @@ class Arena:
             s, t = self._frames(points[rows])
             np.abs(s[:, self._n_sides :], out=s[:, self._n_sides :])
             np.abs(t, out=t)
-            seen = t <= 1.0
-            seen &= s <= reach
-            seen &= s >= -TOUCH_M
-            # Views: the wall's number is the column, and few are seen.
+            visible = t <= 1.0
+            visible &= s <= reach
+            visible &= s >= -TOUCH_M
+            # Views of the results, which are written in place.
             near, towards = distance[rows, :n_straight], bearing[rows, :n_straight]
-            np.copyto(near, s, where=seen)
+            np.copyto(near, s, where=visible)
             np.maximum(near, 0.0, out=near)
-            np.copyto(towards, self._bearing, where=seen)
+            np.copyto(towards, self._bearing, where=visible)
         for k in range(len(self._circles)):
-            self._see_circle(points, reach, k, distance, bearing)
+            self._add_circle(points, reach, k, distance, bearing)
         if not self.is_convex:
-            self._finish_straight(points, distance, bearing)
+            self._remove_hidden(points, distance, bearing)
         return distance, bearing
 
     def nearest_walls(
         self, positions: ArrayLike, reach_m: float, k: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Find the ``k`` nearest of :meth:`walls_near`, nearest first, for sensors of fixed width.
+        """Find the ``k`` nearest walls of :meth:`walls_near`, nearest first.
 
         Returns:
-            Distance in metres and bearing, ``(n, k)``; ``inf`` and 0 where there are no more.
+            Distance in metres and bearing, ``(n, k)``; ``inf`` and 0 where there are fewer walls.
 
         Example:
             >>> named_arena("square").nearest_walls([(0.9, -0.8)], 0.3, k=3)[0].round(6).tolist()
@@ -351,19 +351,19 @@ class Arena:
     def ranges(
         self, positions: ArrayLike, headings_rad: ArrayLike, n_beams: int, reach_m: float
     ) -> np.ndarray:
-        """Measure as a lidar does: how far it is to the first wall along each beam.
+        """Return the ranges of a lidar: the distance to the first wall along each beam.
 
         Args:
             positions: In metres, ``(n, 2)``.
-            headings_rad: ``(n,)``.
-            n_beams: Beams, evenly over the full turn, counter-clockwise from straight ahead.
-            reach_m: The farthest that is measured; may be ``inf``.
+            headings_rad: Headings, ``(n,)``.
+            n_beams: Number of beams, evenly over the full turn, counter-clockwise from ahead.
+            reach_m: Largest range; may be ``inf``.
 
         Returns:
-            Metres, ``(n, n_beams)``, ``inf`` where nothing is in reach.
+            Metres, ``(n, n_beams)``, ``inf`` where nothing is in range.
 
         Raises:
-            SourceError: If the shapes are wrong or the reach is not above zero.
+            SourceError: If the shapes are wrong or the reach is not positive.
 
         Example:
             >>> named_arena("square").ranges([(0.5, 0.0)], [0.0], 4, reach_m=1.2).tolist()
@@ -374,7 +374,7 @@ class Arena:
         if headings.shape != (len(points),) or n_beams < 1:
             raise SourceError(
                 f"{self.name}: {len(points)} positions, headings of shape {headings.shape}, "
-                f"{n_beams} beams; expected one heading a position and at least 1 beam"
+                f"{n_beams} beams; expected one heading per position and at least 1 beam"
             )
         beams = TWO_PI * np.arange(n_beams) / n_beams
         found = np.empty((len(points), n_beams))
@@ -385,14 +385,14 @@ class Arena:
         return np.where(found <= reach, found, np.inf)
 
     def _cast(self, points: np.ndarray, ray: np.ndarray) -> np.ndarray:
-        """Distance along each ray ``(n * b, 2)``, ``b`` from each of the points, to a wall."""
+        """Return the distance to a wall along rays ``(n * b, 2)``, ``b`` from each point."""
         repeat = len(ray) // len(points)
         s, t = self._frames(points)
         side = np.where(s < 0.0, -1.0, 1.0)
-        side[:, : self._n_sides] = 1.0  # the others have two faces
+        side[:, : self._n_sides] = 1.0  # free-standing walls have two faces
         s = s * side
         s = np.where(s >= -TOUCH_M, np.maximum(s, 0.0), np.inf)
-        # Walls first, rays last: the reduction over walls is then one of whole rows.
+        # Walls first, rays last: the reduction over walls is then over contiguous rows.
         s, t, side = (np.repeat(a.T, repeat, axis=1) for a in (s, t, side))
         closing = -(self._off[0].T @ ray.T) * side
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -411,12 +411,12 @@ class Arena:
                 along = -b - np.sqrt(np.maximum(root, 0.0))
                 along = np.where((root >= 0.0) & (b < 0.0), along, np.inf)
             first = np.fmin(first, along)
-        return first
+        return np.asarray(first)
 
-    def _see_circle(
+    def _add_circle(
         self, points: np.ndarray, reach: float, k: int, distance: np.ndarray, bearing: np.ndarray
     ) -> None:
-        """Fill in the column of a circle."""
+        """Write distance and bearing of a circle into their column."""
         around = self._round and k == 0
         out = points - self._circles[k, :2]
         gap = np.hypot(*out.T) - self._circles[k, 2]
@@ -433,7 +433,7 @@ class Arena:
         bearing[rows, len(self._half) + k] = towards
 
     def _between(self, here: np.ndarray, there: np.ndarray, circle: int) -> np.ndarray:
-        """Tell whether a wall stands between points ``(n, 2)``; not that circle, nor the round."""
+        """Return whether a wall separates points ``(n, 2)``, except one circle and the boundary."""
         hidden = np.zeros(len(here), dtype=bool)
         for rows in self._chunks(len(here)):
             (s0, t0), (s1, t1) = self._frames(here[rows]), self._frames(there[rows])
@@ -447,28 +447,26 @@ class Arena:
                 hidden |= gap < self._circles[k, 2] - TOUCH_M
         return hidden
 
-    def _finish_straight(
-        self, points: np.ndarray, distance: np.ndarray, bearing: np.ndarray
-    ) -> None:
-        """Strike out the straight walls that are hidden; turn those seen from their right side."""
+    def _remove_hidden(self, points: np.ndarray, distance: np.ndarray, bearing: np.ndarray) -> None:
+        """Remove hidden straight walls; reverse the bearing of walls seen from their right side."""
         rows, walls = np.nonzero(distance[:, : len(self._half)] < np.inf)
         order = np.argsort(walls, kind="stable")
-        seen, first = np.unique(walls[order], return_index=True)
-        for wall, at in zip(seen.tolist(), np.split(rows[order], first[1:]), strict=False):
+        visible, first = np.unique(walls[order], return_index=True)
+        for wall, at in zip(visible.tolist(), np.split(rows[order], first[1:]), strict=False):
             gap = points[at] - self._middle[wall]
             t, s = gap @ self._along[wall], gap @ self._normal[wall]
             left, *right = self._blockers[wall]
             hidden = left.hide(t, s)
             if right:
-                turned = s < 0.0
-                bearing[at[turned], wall] = bearings_of(self._normal[wall : wall + 1])
-                hidden = np.where(turned, right[0].hide(t, -s), hidden)
+                reverse = s < 0.0
+                bearing[at[reverse], wall] = bearings_of(self._normal[wall : wall + 1])
+                hidden = np.where(reverse, right[0].hide(t, -s), hidden)
             distance[at[hidden], wall], bearing[at[hidden], wall] = np.inf, 0.0
 
     @cached_property
     def _blockers(self) -> list[tuple[_Blockers, ...]]:
-        """For each straight wall what may hide its left face, and for free ones its right."""
-        found = []
+        """Obstacles of the left face of each straight wall, and of a free one's right face."""
+        found: list[tuple[_Blockers, ...]] = []
         pillars = self._circles[int(self._round) :]
         for i, half in enumerate(self._half):
             frame = np.column_stack([self._along[i], self._normal[i]])
@@ -476,7 +474,7 @@ class Arena:
                 ((ends - self._middle[i]) @ frame).T for ends in (self._starts, self._ends)
             )
             low, high, run = np.minimum(t0, t1), np.maximum(t0, t1), t1 - t0
-            # A wall at right angles to this one stands along the line of sight, not across it.
+            # A wall perpendicular to this one is parallel to the line of sight, and hides nothing.
             over = (low < half) & (high > -half) & (np.abs(run) > TOUCH_M)
             over[i] = False
             slope = (s1 - s0) / np.where(over, run, 1.0)
@@ -492,7 +490,7 @@ class Arena:
         return found
 
     def _frames(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far off each straight wall ``(n, W)``, left positive, and how far along, -1 to 1."""
+        """Return distances off the straight walls ``(n, W)``, left positive; -1 to 1 along them."""
         local = points - self._origin
         s, t = local @ self._off[0], local @ self._on[0]
         s -= self._off[1]
@@ -500,12 +498,12 @@ class Arena:
         return s, t
 
     def _beyond_circles(self, points: np.ndarray) -> np.ndarray:
-        """How far outside each circle ``(n, c)``."""
+        """Return the distance outside each circle, ``(n, c)``."""
         gap = points[:, None] - self._circles[:, :2]
-        return np.hypot(gap[..., 0], gap[..., 1]) - self._circles[:, 2]
+        return np.asarray(np.hypot(gap[..., 0], gap[..., 1]) - self._circles[:, 2])
 
     def _chunks(self, n: int, each: int = 1) -> Iterator[slice]:
-        """Slices of positions whose temporaries stay in the cache."""
+        """Return slices of the positions whose temporary arrays fit into the cache."""
         rows = max(1, _CHUNK // (each * max(self.n_walls, 1)))
         return (slice(start, start + rows) for start in range(0, n, rows))
 
@@ -524,45 +522,45 @@ class Arena:
 
     def _check_holes(self) -> None:
         for k, hole in enumerate(self.holes):
-            who = f"{self.name}: hole {k}"
+            this = f"{self.name}: hole {k}"
             if meet(hole, self.boundary):
-                raise SourceError(f"{who} crosses or touches the boundary; expected it inside")
+                raise SourceError(f"{this} crosses or touches the boundary; expected it inside")
             if not within(vertices_of(hole)[:1], self.boundary)[0]:
-                raise SourceError(f"{who} lies outside the boundary; expected it inside")
+                raise SourceError(f"{this} lies outside the boundary; expected it inside")
             for other, outline in enumerate(self.holes[:k]):
                 inside = within(vertices_of(hole)[:1], outline) | within(
                     vertices_of(outline)[:1], hole
                 )
                 if inside[0] or meet(hole, outline):
                     raise SourceError(
-                        f"{who} and hole {other} touch or overlap; expected them apart, or as one"
+                        f"{this} and hole {other} touch or overlap; separate or join them"
                     )
 
     def _check_walls(self) -> None:
         for k, ends in enumerate(self.walls):
-            who = f"{self.name}: wall {k} from {tuple(ends[0].tolist())} to "
-            who += f"{tuple(ends[1].tolist())} m"
+            this = f"{self.name}: wall {k} from {tuple(ends[0].tolist())} to "
+            this += f"{tuple(ends[1].tolist())} m"
             n = self._n_sides
             crossed = crossings(ends[:1], ends[1:], self._starts[:n], self._ends[:n]).any()
             for pillar in self._circles[int(self._round) :]:
                 gap = to_segments(pillar[None, :2], ends[:1], ends[1:])
                 crossed |= bool(gap[0, 0] < pillar[2] - TOUCH_M)
             if crossed:
-                raise SourceError(f"{who} crosses the boundary or a hole; end it there")
+                raise SourceError(f"{this} crosses the boundary or a hole; end it there")
             if not self.contains([ends[0], ends.mean(axis=0), ends[1]]).all():
-                raise SourceError(f"{who} lies outside the arena; expected it inside")
+                raise SourceError(f"{this} lies outside the arena; expected it inside")
 
 
 def named_arena(name: str) -> Arena:
-    """Make one of the arenas that are known by name, about the origin.
+    """Make an arena by its name, around the origin.
 
     ``triangle``, ``pentagon`` and ``nonagon`` are those of the simulated tracks, ``circle2m`` and
-    ``circle1m`` (by diameter) those of the recorded ones; ``square`` is 2 m wide, ``rectangle``
+    ``circle1m`` (by diameter) those of the recorded tracks; ``square`` is 2 m wide, ``rectangle``
     2.5 x 3.5 m; ``two_rooms`` are 1 x 1 m each with a door of 0.3 m; ``pillar`` is the square with
-    a round pillar, 0.25 m in radius, in its middle.
+    a pillar of radius 0.25 m in its middle.
 
     Raises:
-        SourceError: If there is none of that name.
+        SourceError: If there is no arena of that name.
 
     Example:
         >>> named_arena("pentagon").n_walls

@@ -1,7 +1,7 @@
-"""All surfaces of a world in one picture, at halving resolutions, so that one lookup draws a frame.
+"""Texture atlas: all surfaces of a world in one image, so that one lookup draws a frame.
 
-Far walls cover many of their own pixels per pixel of the frame; looked up one by one they would
-flicker. So a wall is kept at every pair of (horizontal, vertical) halvings, averaged beforehand
+A pixel of the frame may cover many texture pixels of a far wall; sampling a single one would
+flicker. So a wall is stored at every pair of (horizontal, vertical) halvings, averaged beforehand
 (a "rip-map"; Akenine-Moeller et al., Real-Time Rendering), and ground and ceiling at equal halvings
 (a "mip-map"; Williams 1983).
 """
@@ -17,15 +17,15 @@ _PAD = 2
 
 
 class Atlas:
-    """Packs pictures on shelves of one image.
+    """Packs textures on shelves of one image.
 
     Attributes:
         image: ``uint8 (h, w, 3)``.
-        strip_origin: ``(n, LEVELS_U, LEVELS_V, 2)``: column and row of each strip's first pixel.
-        strip_scale: ``(n, LEVELS_U, LEVELS_V, 2)``: pixels per metre along and up.
-        strip_per_m: ``(n,)``: pixels per metre at full size.
-        ground: ``(LEVELS_GROUND, 4)``: column, row, columns and rows per full-size pixel.
-        ceiling: Same, or ``None``.
+        strip_origin: Column and row of each strip's first pixel, ``(n, LEVELS_U, LEVELS_V, 2)``.
+        strip_scale: Pixels per metre along and up, ``(n, LEVELS_U, LEVELS_V, 2)``.
+        strip_per_m: Pixels per metre at full size, ``(n,)``.
+        ground: Column, row, columns and rows per full-size pixel, ``(LEVELS_GROUND, 4)``.
+        ceiling: The same of the ceiling, or ``None``.
         sky: Column, row, width and height of the sky, or ``None``.
     """
 
@@ -67,7 +67,7 @@ class Atlas:
 
 
 def halvings(image: np.ndarray) -> list[np.ndarray]:
-    """Return a picture at full, half, quarter ... size, down to four pixels."""
+    """Return an image at full, half, quarter ... size, down to four pixels."""
     levels = 1
     while min(image.shape[:2]) >> levels >= 4:
         levels += 1
@@ -80,7 +80,7 @@ def _halved(image: np.ndarray, times_u: int, times_v: int) -> np.ndarray:
 
 
 def _pack(tiles: list[np.ndarray], wrapped: int) -> tuple[np.ndarray, np.ndarray]:
-    """Put tiles on shelves, highest first; each has a margin of its own edge (or wraps around)."""
+    """Put tiles on shelves, highest first; each with a margin of its edge, or wrapped around."""
     width = max(_WIDTH, max(tile.shape[1] for tile in tiles) + 2 * _PAD)
     corners = np.zeros((len(tiles), 2), dtype=np.int64)
     x = y = shelf = 0

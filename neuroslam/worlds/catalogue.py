@@ -1,4 +1,4 @@
-"""The rendered worlds there are: geometry, looks and routes of each."""
+"""The rendered worlds: geometry, textures and routes of each."""
 
 import math
 from collections.abc import Callable
@@ -26,8 +26,8 @@ def _ring(semi_x: float, semi_y: float, n: int, clockwise: bool) -> list[Point]:
     return ring[::-1] if clockwise else ring
 
 
-def _indoors(height: float, things: tuple[paint.Thing, ...], per_m: float = 64.0) -> Painter:
-    return lambda rng, length: (paint.interior(rng, length, height, per_m, things), per_m)
+def _indoors(height: float, objects: tuple[paint.WallObject, ...], per_m: float = 64.0) -> Painter:
+    return lambda rng, length: (paint.interior(rng, length, height, per_m, objects), per_m)
 
 
 def _corridor(look: int) -> World:
@@ -51,7 +51,7 @@ def _corridor(look: int) -> World:
     site.pillar(6.1, -3.85, 0.22, height, (205, 200, 188))
     site.pillar(-1.2, 3.98, 0.2, height, (205, 200, 188))
     ground = paint_outdoors.floor(site.rng, 13.0, 8.6, 40.0, "carpet")
-    for a, b in ((3.2, -0.6), (-4.0, 0.6)):  # runners of another colour, so that floors differ too
+    for a, b in ((3.2, -0.6), (-4.0, 0.6)):  # carpets of another colour, so that floors differ too
         tone = paint.hue(site.rng.uniform(0, 360), 0.35, 0.5)
         paint.plaster(ground.part(6.5 + a, 0.0, 6.5 + a + 1.6, 2.2), site.rng, tone, 0.15)
         paint.plaster(ground.part(6.5 + b, 6.4, 6.5 + b + 2.5, 8.6), site.rng, tone, 0.15)
@@ -185,7 +185,7 @@ def _town(look: int) -> World:
 
 
 def _streets(rng: np.random.Generator) -> Surface:
-    """Lay asphalt with pavements along the houses, dashes in the middle, crossings."""
+    """Paint asphalt with pavements along the houses, centre lines and crossings."""
     per_m = 14.0
     c = paint_outdoors.floor(rng, 77.0, 65.0, per_m, "asphalt")
     edges_x, edges_y = (-38.0, -30.0, -4.0, 4.0, 30.0, 38.0), (-32.0, -24.0, -4.0, 4.0, 24.0, 32.0)
@@ -288,7 +288,7 @@ def _campus(look: int) -> World:
 
 
 def _lawns(rng: np.random.Generator, routes: list[Route]) -> Surface:
-    """Lay grass with gravel paths along the routes."""
+    """Paint grass with gravel paths along the routes."""
     per_m = 8.0
     c = paint_outdoors.floor(rng, 202.0, 102.0, per_m, "grass")
     for route in routes:
@@ -313,7 +313,7 @@ _BUILDERS: dict[str, Callable[[int], World]] = {
 
 
 def catalogue() -> dict[str, str]:
-    """Return the names of the rendered worlds and what each is.
+    """Return the description of each rendered world by its name.
 
     Example:
         >>> list(catalogue())
@@ -324,19 +324,19 @@ def catalogue() -> dict[str, str]:
 
 @lru_cache(maxsize=2)
 def build_world(name: str, look: int = 0) -> World:
-    """Build a world of the :func:`catalogue`; equal arguments give the same one.
+    """Build a world of the :func:`catalogue`; equal arguments return the same object.
 
     Args:
-        name: Its name.
-        look: Seed of everything painted, and of where houses, trees and pillars end and stand;
-            routes, and walls indoors, do not depend on it.
+        name: Name of the world.
+        look: Seed of all textures, and of the positions of houses, trees and pillars; routes and
+            indoor walls do not depend on it.
 
     Raises:
         SourceError: If there is no such world.
     """
     if name not in _BUILDERS:
         raise SourceError(
-            f"world {name!r}: there is none; there are {', '.join(_BUILDERS)}"
+            f"world {name!r}: no such world; expected one of {', '.join(_BUILDERS)}"
             f"{did_you_mean(name, _BUILDERS)}"
         )
     return _BUILDERS[name](look)

@@ -1,4 +1,4 @@
-"""Paths through worlds of landmarks: random, recorded, in two or three dimensions."""
+"""Paths through worlds of landmarks in two or three dimensions, random or recorded."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,12 +11,12 @@ from neuroslam.worlds.rodent import Walk
 
 
 class LandmarkPath(NamedTuple):
-    """Where an animal is, at even steps.
+    """Positions of an animal at equal time steps.
 
     Attributes:
-        time_step_s: Between two rows.
-        position_m: ``(steps, dimension)``; in units of the box, see ``metres``.
-        metres: How many a unit of the positions is, if they were scaled into a box.
+        time_step_s: Time between two rows in seconds.
+        position_m: ``(steps, dimension)``; scaled to the box, see ``metres``.
+        metres: Metres per unit of the positions, if they were scaled to a box.
     """
 
     time_step_s: float
@@ -25,26 +25,26 @@ class LandmarkPath(NamedTuple):
 
     @property
     def velocity_m_s(self) -> np.ndarray:
-        """Backward differences, ``(steps, dimension)``; nothing at first."""
+        """Backward differences of the positions, ``(steps, dimension)``; the first is zero."""
         return np.diff(self.position_m, axis=0, prepend=self.position_m[:1]) / self.time_step_s
 
     @property
     def time_s(self) -> np.ndarray:
-        """Since the first row, ``(steps,)``."""
+        """Time since the first row, ``(steps,)``."""
         return np.arange(len(self.position_m)) * self.time_step_s
 
     def resampled(self, time_step_s: float) -> "LandmarkPath":
-        """Return the same path at other steps, through a cubic spline."""
+        """Return the path at another time step, interpolated by a cubic spline."""
         if time_step_s == self.time_step_s:
             return self
         n = round((len(self.position_m) - 1) * self.time_step_s / time_step_s) + 1
-        at = np.minimum(np.arange(n) * time_step_s, self.time_s[-1])
+        times = np.minimum(np.arange(n) * time_step_s, self.time_s[-1])
         return self._replace(
-            time_step_s=time_step_s, position_m=_spline(self.time_s, self.position_m, at)
+            time_step_s=time_step_s, position_m=_spline(self.time_s, self.position_m, times)
         )
 
     def first(self, seconds: float) -> "LandmarkPath":
-        """Return its beginning."""
+        """Return the first seconds of the path."""
         return self._replace(position_m=self.position_m[: round(seconds / self.time_step_s)])
 
 
@@ -56,18 +56,18 @@ def band_limited_path(
     time_step_s: float = 1e-3,
     reach_m: float = 0.9,
 ) -> LandmarkPath:
-    """Make a path of white noise below a frequency, each coordinate scaled to the reach.
+    """Make a path of band-limited white noise, with each coordinate scaled to the reach.
 
     Args:
-        duration_s: After which it would repeat.
-        limit_hz: Highest frequency in it.
-        dimension: Of the space.
-        seed: Of the noise.
-        time_step_s: Between two rows.
-        reach_m: Largest coordinate.
+        duration_s: Duration, and period of the noise.
+        limit_hz: Highest frequency.
+        dimension: Dimension of the space.
+        seed: Seed of the noise.
+        time_step_s: Time between two rows.
+        reach_m: Largest absolute coordinate.
 
     Raises:
-        SourceError: If there is no frequency below the limit.
+        SourceError: If the duration is shorter than one period of the limit.
 
     Example:
         >>> path = band_limited_path(20.0, 0.1, seed=1, time_step_s=0.01)
@@ -77,12 +77,12 @@ def band_limited_path(
     n, highest = round(duration_s / time_step_s), int(limit_hz * duration_s)
     if highest < 1:
         raise SourceError(
-            f"a path of {duration_s} s has no frequency below {limit_hz} Hz; make it longer than "
-            f"{1 / limit_hz:.0f} s"
+            f"a path of {duration_s} s has no frequency below {limit_hz} Hz; expected at "
+            f"least {1 / limit_hz:.1f} s"
         )
-    draw = np.random.default_rng(seed)
+    generator = np.random.default_rng(seed)
     waves = np.zeros((n // 2 + 1, dimension), dtype=np.complex128)
-    real, imaginary = draw.standard_normal((2, highest, dimension))
+    real, imaginary = generator.standard_normal((2, highest, dimension))
     waves[1 : highest + 1] = real + 1j * imaginary
     x = np.fft.irfft(waves, n=n, axis=0)
     low, high = x.min(0), x.max(0)
@@ -90,16 +90,16 @@ def band_limited_path(
 
 
 def read_path(path: str | Path, time_step_s: float = 1e-3, reach_m: float = 0.9) -> LandmarkPath:
-    """Read a recorded path into a box: ``.npy`` of positions, or ``.csv`` with times before them.
+    """Read a recorded path, scaled to a box.
 
     Args:
-        path: A ``.npy`` has a row of coordinates for each step; a ``.csv`` has rows of a time in
-            seconds and the coordinates, with or without a line of names above.
-        time_step_s: Between two rows of a ``.npy``, and of what is returned.
-        reach_m: The longest side is scaled to twice this, all axes by one factor.
+        path: A ``.npy`` with one row of coordinates per step, or a ``.csv`` with a time in seconds
+            and the coordinates per row, with or without a header.
+        time_step_s: Time between two rows of a ``.npy``, and of the result.
+        reach_m: Half the longest side after scaling, all axes by one factor.
 
     Raises:
-        SourceError: If it cannot be read, or is no path.
+        SourceError: If the file cannot be read, or contains no path.
     """
     path = Path(path)
     try:
@@ -111,13 +111,13 @@ def read_path(path: str | Path, time_step_s: float = 1e-3, reach_m: float = 0.9)
             table = table[1:] if np.isnan(table[:1]).all() else table
             times, table = table[:, 0], table[:, 1:]
         else:
-            raise SourceError(f"{path}: a path is a .npy or a .csv file")
-    except OSError:
-        raise SourceError(f"{path}: cannot be read") from None
+            raise SourceError(f"{path}: unknown suffix; expected a .npy or a .csv file")
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, IndexError) as error:
         if isinstance(error, SourceError):
             raise
-        raise SourceError(f"{path}: not a table of numbers ({error})") from None
+        raise SourceError(f"{path}: is damaged ({error}); expected a table of numbers") from None
     return _into_box(times, table, time_step_s, reach_m, str(path))
 
 
@@ -126,13 +126,13 @@ def read_kitti(
 ) -> LandmarkPath:
     """Read the true poses of a KITTI odometry sequence as a path in three dimensions.
 
-    The camera's axes are turned to east, north and up: x is to the right, z ahead and y down.
+    The camera's axes (x right, y down, z ahead) are converted to x right, y ahead, z up.
 
     Args:
-        folder: Holds ``KITTI_00_gt.txt`` and ``KITTI_00_gt_times.txt``, or other sequences'.
-        sequence: Its number.
-        time_step_s: Of the path.
-        reach_m: The longest side is scaled to twice this, all axes by one factor.
+        folder: Folder of ``KITTI_00_gt.txt`` and ``KITTI_00_gt_times.txt``, or other sequences.
+        sequence: Number of the sequence.
+        time_step_s: Time step of the path.
+        reach_m: Half the longest side after scaling, all axes by one factor.
 
     Raises:
         SourceError: If a file is missing or has other columns.
@@ -142,45 +142,50 @@ def read_kitti(
     )
     if poses.shape[1] != 12 or times.shape[1] != 1 or len(poses) != len(times):
         raise SourceError(
-            f"{folder}: poses {poses.shape} and times {times.shape}, expected 12 numbers and one "
-            "in each of as many rows"
+            f"{folder}: poses have shape {poses.shape}, times {times.shape}; expected (n, 12) and "
+            "(n, 1)"
         )
-    at = np.stack([poses[:, 3], poses[:, 11], -poses[:, 7]], axis=-1)
-    return _into_box(times[:, 0], at, time_step_s, reach_m, str(folder))
+    positions = np.stack([poses[:, 3], poses[:, 11], -poses[:, 7]], axis=-1)
+    return _into_box(times[:, 0], positions, time_step_s, reach_m, str(folder))
 
 
 def path_of_walk(walk: Walk, time_step_s: float = 1e-3, reach_m: float = 0.9) -> LandmarkPath:
-    """Take a rodent's walk, scaled into a box."""
+    """Convert a rodent's walk to a path, scaled to a box."""
     return _into_box(walk.times_s, walk.positions, time_step_s, reach_m, walk.name)
 
 
 def _table(path: Path) -> np.ndarray:
     try:
         return np.loadtxt(path, ndmin=2)
-    except OSError:
-        raise SourceError(f"{path}: cannot be read") from None
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValueError as error:
-        raise SourceError(f"{path}: not a table of numbers ({error})") from None
+        raise SourceError(f"{path}: is damaged ({error}); expected a table of numbers") from None
 
 
 def _into_box(
-    times: np.ndarray, at: np.ndarray, time_step_s: float, reach_m: float, who: str
+    times: np.ndarray, positions: np.ndarray, time_step_s: float, reach_m: float, name: str
 ) -> LandmarkPath:
-    """Scale positions into a box, all axes alike, and sample them evenly."""
-    if at.ndim != 2 or len(at) < 4 or at.shape[1] < 1:
-        raise SourceError(f"{who}: positions of shape {at.shape}, expected (at least 4, dimension)")
-    if not np.isfinite(at).all() or not (np.diff(times) > 0).all():
-        raise SourceError(f"{who}: positions must be numbers, and times must rise")
-    low, high = at.min(0), at.max(0)
+    """Scale positions to a box, all axes by one factor, and sample them at equal steps."""
+    if positions.ndim != 2 or len(positions) < 4 or positions.shape[1] < 1:
+        raise SourceError(
+            f"{name}: positions have shape {positions.shape}; expected (n, dimension), n at least 4"
+        )
+    if not np.isfinite(positions).all() or not (np.diff(times) > 0).all():
+        raise SourceError(
+            f"{name}: a position is not finite, or a time does not rise; expected finite positions "
+            "and rising times"
+        )
+    low, high = positions.min(0), positions.max(0)
     metres = float((high - low).max()) / (2.0 * reach_m)
     if metres == 0:
-        raise SourceError(f"{who}: it stays at one place")
-    scaled = (at - (low + high) / 2) / metres
+        raise SourceError(f"{name}: all positions are equal; expected a path")
+    scaled = (positions - (low + high) / 2) / metres
     n = int((times[-1] - times[0]) / time_step_s + 1e-9) + 1
     even = times[0] + np.arange(n) * time_step_s
-    position = _spline(times, scaled, np.minimum(even, times[-1]))
-    return LandmarkPath(time_step_s, np.clip(position, -reach_m, reach_m), metres)
+    sampled = _spline(times, scaled, np.minimum(even, times[-1]))
+    return LandmarkPath(time_step_s, np.clip(sampled, -reach_m, reach_m), metres)
 
 
-def _spline(times: np.ndarray, at: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    return make_interp_spline(times, at, k=3)(wanted)
+def _spline(times: np.ndarray, positions: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    return np.asarray(make_interp_spline(times, positions, k=3)(wanted))

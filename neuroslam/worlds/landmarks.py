@@ -1,4 +1,4 @@
-"""Worlds of landmarks: points and walls with names, seen from nearby."""
+"""Worlds of landmarks: named points and walls that are visible from nearby."""
 
 import json
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ class Landmark(NamedTuple):
     """A point or a wall.
 
     Attributes:
-        name: For people.
-        pointer: What it is, in words: names, ``*`` to bind, ``+`` to add.
-        boxes_m: Lower and upper corners, ``(n, 2, dimension)``; a point has both alike.
+        name: Name in reports.
+        pointer: Expression of its semantic pointer: names, ``*`` for binding, ``+`` for addition.
+        boxes_m: Lower and upper corners, ``(n, 2, dimension)``; those of a point are equal.
     """
 
     name: str
@@ -28,24 +28,24 @@ class Landmark(NamedTuple):
 
     @property
     def is_point(self) -> bool:
-        """Whether it has no extent."""
+        """Whether the landmark has no extent."""
         return len(self.boxes_m) == 1 and bool((self.boxes_m[0, 0] == self.boxes_m[0, 1]).all())
 
     @property
     def position_m(self) -> np.ndarray:
-        """Its centre, ``(dimension,)``."""
-        return self.boxes_m.mean((0, 1))
+        """Centre of the landmark, ``(dimension,)``."""
+        return np.asarray(self.boxes_m.mean((0, 1)))
 
 
 class LandmarkView(NamedTuple):
-    """What is seen from positions; vectors are from there, in the world's directions.
+    """Landmarks as seen from positions; vectors start there and have the world's axes.
 
     Attributes:
-        in_view: ``(..., landmarks)``, booleans.
-        distance_m: To the nearest point of each, ``(..., landmarks)``.
-        low_m: Lower corners of all boxes, ``(..., boxes, dimension)``.
-        high_m: Upper corners.
-        box_landmark: Whose box each is, ``(boxes,)``.
+        in_view: Whether each landmark is in view, ``(..., landmarks)`` bool.
+        distance_m: Distance to the nearest point of each landmark, ``(..., landmarks)``.
+        low_m: Vectors to the lower corners of all boxes, ``(..., boxes, dimension)``.
+        high_m: Vectors to the upper corners.
+        box_landmark: Landmark of each box, ``(boxes,)``.
     """
 
     in_view: np.ndarray
@@ -56,12 +56,12 @@ class LandmarkView(NamedTuple):
 
 
 class LandmarkWorld(NamedTuple):
-    """Landmarks, and from how far they are seen.
+    """Landmarks in a box, and the distance up to which they are in view.
 
     Attributes:
-        landmarks: All of them, no name twice.
-        bounds_m: Where animals can be, ``(dimension, 2)``.
-        view_radius_m: A landmark is in view if its nearest point is not farther than this.
+        landmarks: All landmarks; names are unique.
+        bounds_m: Lower and upper bounds of positions, ``(dimension, 2)``.
+        view_radius_m: Largest distance of a landmark's nearest point at which it is in view.
 
     Example:
         >>> world = random_world(n_landmarks=3, seed=0)
@@ -76,12 +76,12 @@ class LandmarkWorld(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the landmarks."""
+        """Names of the landmarks."""
         return tuple(landmark.name for landmark in self.landmarks)
 
     @property
     def dimension(self) -> int:
-        """Of the space."""
+        """Dimension of the space."""
         return len(self.bounds_m)
 
     @property
@@ -91,28 +91,28 @@ class LandmarkWorld(NamedTuple):
 
     @property
     def box_landmark(self) -> np.ndarray:
-        """Whose box each is, ``(boxes,)``."""
+        """Landmark of each box, ``(boxes,)``."""
         return np.repeat(
             np.arange(len(self.landmarks)), [len(landmark.boxes_m) for landmark in self.landmarks]
         )
 
     def named(self, name: str) -> Landmark:
-        """Return a landmark by its name, or raise a ``SourceError`` that lists the names."""
+        """Return a landmark by its name; a ``SourceError`` lists the names."""
         if name not in self.names:
-            raise SourceError(f"no landmark {name!r}; there is {', '.join(self.names)}")
+            raise SourceError(f"no landmark {name!r}; expected one of {', '.join(self.names)}")
         return self.landmarks[self.names.index(name)]
 
     def observe(self, position_m: np.ndarray) -> LandmarkView:
-        """Return what is seen from positions, ``(..., dimension)``.
+        """Return the view of the landmarks from positions, ``(..., dimension)``.
 
         Raises:
-            SourceError: If a position is not a number, outside the bounds, or does not fit.
+            SourceError: If a position is NaN, outside the bounds, or of another dimension.
         """
         position = self._inside(np.asarray(position_m, dtype=np.float64))
         boxes, owner = self.boxes_m, self.box_landmark
         low = boxes[:, 0] - position[..., None, :]
         high = boxes[:, 1] - position[..., None, :]
-        # How far the origin is outside of a box, along each axis.
+        # Distance of the origin from the box along each axis, 0 inside.
         gap = np.maximum(np.maximum(low, -high), 0.0)
         to_box = np.linalg.norm(gap, axis=-1)
         distance = np.stack(
@@ -123,56 +123,56 @@ class LandmarkWorld(NamedTuple):
     def _inside(self, position: np.ndarray) -> np.ndarray:
         if position.shape[-1:] != (self.dimension,):
             raise SourceError(
-                f"positions of shape {position.shape}, expected (..., {self.dimension})"
+                f"positions have shape {position.shape}; expected (..., {self.dimension})"
             )
-        ok = (position >= self.bounds_m[:, 0]) & (position <= self.bounds_m[:, 1])
-        if not ok.all():
-            first = position[~ok.all(-1)][0]
+        inside = (position >= self.bounds_m[:, 0]) & (position <= self.bounds_m[:, 1])
+        if not inside.all():
+            first = position[~inside.all(-1)][0]
             raise SourceError(
                 f"position {first.tolist()} m is outside the bounds {self.bounds_m.tolist()}, or "
-                "not a number; mend the path or give the world larger bounds"
+                "not a number; change the path, or give the world larger bounds"
             )
         return position
 
 
 def point(name: str, position_m: Sequence[float], pointer: str | None = None) -> Landmark:
-    """Make a landmark without extent."""
+    """Make a point landmark, without extent."""
     at = np.asarray(position_m, dtype=np.float64)
     return Landmark(name, pointer or name, np.stack([at, at])[None])
 
 
 def wall(name: str, *boxes_m: Sequence[Sequence[float]], pointer: str | None = None) -> Landmark:
-    """Make a landmark of boxes, each a lower and an upper corner."""
+    """Make a landmark of boxes, each given by its lower and upper corners."""
     return Landmark(name, pointer or name, np.asarray(boxes_m, dtype=np.float64))
 
 
 def make_world(
     landmarks: Sequence[Landmark], reach_m: float = 1.0, view_radius_m: float = 0.2
 ) -> LandmarkWorld:
-    """Put landmarks into the box [-reach, reach].
+    """Make a world of landmarks in the box [-reach, reach].
 
     Raises:
-        SourceError: If there is none, a name is there twice, one lies outside or is not a number,
-            or they have not the same dimension.
+        SourceError: If there are no landmarks, a name is not unique, a landmark is outside or NaN,
+            or the dimensions differ.
     """
     if not landmarks:
-        raise SourceError("a world of landmarks needs at least one")
+        raise SourceError("a world of landmarks is empty; expected at least one landmark")
     names = [landmark.name for landmark in landmarks]
     for name in names:
         if names.count(name) > 1:
-            raise SourceError(f"landmark {name!r} is there twice; give each a name of its own")
+            raise SourceError(f"landmark {name!r} occurs twice; give each landmark its own name")
     dimension = landmarks[0].boxes_m.shape[-1]
     for landmark in landmarks:
         boxes = landmark.boxes_m
         if boxes.ndim != 3 or boxes.shape[1:] != (2, dimension) or not len(boxes):
             raise SourceError(
-                f"landmark {landmark.name!r}: boxes of shape {boxes.shape}, expected (n, 2, "
+                f"landmark {landmark.name!r}: boxes have shape {boxes.shape}; expected (n, 2, "
                 f"{dimension})"
             )
         if not (np.abs(boxes) <= reach_m).all() or not (boxes[:, 0] <= boxes[:, 1]).all():
             raise SourceError(
-                f"landmark {landmark.name!r}: boxes {boxes.tolist()} must lie within {reach_m} m "
-                "and go from a lower to an upper corner"
+                f"landmark {landmark.name!r}: boxes are {boxes.tolist()}; expected corners within "
+                f"{reach_m} m of 0, the lower one first"
             )
     bounds = np.array([[-reach_m, reach_m]] * dimension, dtype=np.float64)
     return LandmarkWorld(tuple(landmarks), bounds, view_radius_m)
@@ -186,28 +186,31 @@ def random_world(
     view_radius_m: float = 0.2,
     attributes: bool = False,
 ) -> LandmarkWorld:
-    """Make a world of points, uniform in the inner 90 % of the box.
+    """Make a world of point landmarks, uniform in the inner 90 % of the box.
 
     Args:
-        n_landmarks: How many.
-        dimension: Of the space.
-        seed: Of the places.
+        n_landmarks: Number of landmarks.
+        dimension: Dimension of the space.
+        seed: Seed of the positions.
         reach_m: Half a side of the box.
-        view_radius_m: From how far they are seen.
-        attributes: Give each a colour and a shape, no pair of them twice.
+        view_radius_m: Distance up to which landmarks are in view.
+        attributes: Give each landmark a unique pair of a colour and a shape.
     """
-    draw = np.random.default_rng(seed)
-    at = draw.uniform(-0.9 * reach_m, 0.9 * reach_m, (n_landmarks, dimension))
+    generator = np.random.default_rng(seed)
+    positions = generator.uniform(-0.9 * reach_m, 0.9 * reach_m, (n_landmarks, dimension))
     names = [f"L{k}" for k in range(n_landmarks)]
     pointers = names
     if attributes:
         pairs = [(c, s) for c in COLOURS for s in SHAPES]
         if n_landmarks > len(pairs):
-            raise SourceError(f"{n_landmarks} landmarks, but only {len(pairs)} colours and shapes")
-        chosen = draw.permutation(len(pairs))[:n_landmarks]
+            raise SourceError(
+                f"{n_landmarks} landmarks for {len(pairs)} pairs of a colour and a shape; expected "
+                f"at most {len(pairs)}"
+            )
+        chosen = generator.permutation(len(pairs))[:n_landmarks]
         names = [f"{pairs[k][0]}_{pairs[k][1]}" for k in chosen]
         pointers = [f"{pairs[k][0]} * {pairs[k][1]}" for k in chosen]
-    made = [point(n, x, p) for n, x, p in zip(names, at, pointers, strict=True)]
+    made = [point(n, x, p) for n, x, p in zip(names, positions, pointers, strict=True)]
     return make_world(made, reach_m, view_radius_m)
 
 
@@ -232,26 +235,26 @@ def read_world(path: str | Path) -> LandmarkWorld:
     {"name": "WALL", "boxes_m": [[[0, 0], [1, 0.1]]], "pointer": "GREY * WALL"}]}``.
 
     Raises:
-        SourceError: If it cannot be read, or is no such world.
+        SourceError: If the file cannot be read, or describes no world.
     """
     path = Path(path)
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        made = [
-            wall(one["name"], *one["boxes_m"], pointer=one.get("pointer"))
-            if "boxes_m" in one
-            else point(one["name"], one["position_m"], one.get("pointer"))
-            for one in told["landmarks"]
+        world = json.loads(path.read_text(encoding="utf-8"))
+        landmarks = [
+            wall(entry["name"], *entry["boxes_m"], pointer=entry.get("pointer"))
+            if "boxes_m" in entry
+            else point(entry["name"], entry["position_m"], entry.get("pointer"))
+            for entry in world["landmarks"]
         ]
         return make_world(
-            made, float(told.get("reach_m", 1)), float(told.get("view_radius_m", 0.2))
+            landmarks, float(world.get("reach_m", 1)), float(world.get("view_radius_m", 0.2))
         )
-    except OSError:
-        raise SourceError(f"{path}: cannot be read") from None
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, SourceError):
             raise SourceError(f"{path}: {error}") from None
         raise SourceError(
-            f"{path}: not a world of landmarks ({type(error).__name__}: {error}); it needs "
-            "landmarks with a name and a position_m or boxes_m each"
+            f"{path}: is no world of landmarks ({type(error).__name__}: {error}); expected "
+            "landmarks, each with a name and a position_m or boxes_m"
         ) from None

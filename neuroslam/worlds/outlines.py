@@ -1,6 +1,6 @@
-"""Outlines in the plane: what is checked of them, and what is inside, near or across them.
+"""Geometry of outlines in the plane: checks, containment, distances and crossings.
 
-An outline is ``(n, 2)`` vertices in metres, not repeating the first, or the three numbers
+An outline is ``(n, 2)`` vertices in metres, the first not repeated, or the three numbers
 ``(x, y, radius)`` of a circle.
 """
 
@@ -14,68 +14,70 @@ from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI
 
 TOUCH_M = 1e-9
-"""Whoever is nearer to a wall than this stands at it, on the side that is free."""
+"""A position nearer to a wall than this is at the wall, on its free side."""
 
 
 def bearings_of(directions: np.ndarray) -> np.ndarray:
-    """Angles of vectors ``(n, 2)``, in (-pi, pi]."""
+    """Return the angles of vectors ``(n, 2)``, in (-pi, pi]."""
     angle = np.arctan2(directions[:, 1], directions[:, 0])
-    return np.where(angle <= -math.pi, math.pi, angle) + 0.0  # no negative zeros
+    return np.asarray(np.where(angle <= -math.pi, math.pi, angle) + 0.0)  # no negative zeros
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products of vectors in the plane, ``(..., 2)``."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    """Return the cross products of vectors in the plane, ``(..., 2)``."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def vertices_of(outline: np.ndarray) -> np.ndarray:
-    """Vertices of an outline, ``(n, 2)``; 180 of a circle."""
+    """Return the vertices of an outline, ``(n, 2)``; a circle has 180."""
     if outline.ndim == 2:
         return outline
     angle = TWO_PI * np.arange(180) / 180
-    return outline[:2] + outline[2] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(outline[:2] + outline[2] * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 
-def checked_outline(values: ArrayLike, who: str) -> np.ndarray:
-    """Check an outline; polygons come back counter-clockwise.
+def checked_outline(values: ArrayLike, name: str) -> np.ndarray:
+    """Check an outline, and return it with the vertices counter-clockwise.
 
     Raises:
-        SourceError: If it has too few vertices, sides without length, or meets itself.
+        SourceError: If it has too few vertices, sides of length 0, or crosses itself.
     """
     outline = np.array(values, dtype=np.float64)
     if outline.shape != (3,) and (outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3):
         raise SourceError(
-            f"{who} has shape {outline.shape}; expected (n, 2) vertices, at least 3, or the centre "
-            "and radius of a circle (3,)"
+            f"{name} has shape {outline.shape}; expected (n, 2) vertices, at least 3, or the "
+            "centre and radius of a circle (3,)"
         )
     if not np.isfinite(outline).all():
-        raise SourceError(f"{who} has numbers that are not finite; expected metres")
+        raise SourceError(f"{name} has numbers that are not finite; expected metres")
     if outline.ndim == 1:
         if outline[2] <= 0:
-            raise SourceError(f"{who} has the radius {outline[2]:g} m; expected more than 0")
+            raise SourceError(f"{name} has the radius {outline[2]} m; expected more than 0")
         return outline
     n, side = len(outline), np.roll(outline, -1, 0) - outline
     short = np.flatnonzero(np.hypot(*side.T) <= TOUCH_M)
     if len(short):
         raise SourceError(
-            f"{who}: side {short[0]} has no length; expected vertices apart, the first not repeated"
+            f"{name}: side {short[0]} has length 0; expected distinct vertices, the first just once"
         )
     ends = np.roll(outline, -1, 0)
     over = crossings(outline, ends, outline, ends)
     touch = to_segments(outline, outline, ends) <= TOUCH_M
     at = np.arange(n)
-    touch[at, at] = touch[at, at - 1] = False  # a vertex is on the two sides that it joins
+    touch[at, at] = touch[at, at - 1] = False  # a vertex is on its own two sides
     i, j = np.nonzero(over | touch)
     if len(i):
-        raise SourceError(f"{who} meets itself at sides {i[0]} and {j[0]}; expected a simple one")
+        raise SourceError(
+            f"{name} crosses itself at sides {i[0]} and {j[0]}; expected a simple polygon"
+        )
     return outline if cross(outline, ends).sum() > 0 else outline[::-1].copy()
 
 
 def checked_walls(walls: Sequence[ArrayLike], name: str) -> np.ndarray:
-    """Check free-standing walls; they come back as ``(n, 2, 2)``.
+    """Check free-standing walls, and return them as ``(n, 2, 2)``.
 
     Raises:
-        SourceError: If one is not two ends apart.
+        SourceError: If a wall is not two distinct points.
     """
     found = np.empty((len(walls), 2, 2))
     for k, wall in enumerate(walls):
@@ -86,33 +88,33 @@ def checked_walls(walls: Sequence[ArrayLike], name: str) -> np.ndarray:
                 "two ends (2, 2) in metres"
             )
         if math.dist(*ends.tolist()) <= TOUCH_M:
-            raise SourceError(f"{name}: wall {k} has no length; expected two ends apart")
+            raise SourceError(f"{name}: wall {k} has length 0; expected two distinct ends")
         found[k] = ends
     return found
 
 
 def within(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Tell which points ``(n, 2)`` are inside one outline: a ray to the right crosses it oddly."""
+    """Return which points ``(n, 2)`` are inside an outline: where a ray crosses it oddly often."""
     if outline.ndim == 1:
-        return np.hypot(*(points - outline[:2]).T) < outline[2]
+        return np.asarray(np.hypot(*(points - outline[:2]).T) < outline[2])
     (x0, y0), (x1, y1) = outline.T, np.roll(outline, -1, 0).T
     x, y = points[:, :1], points[:, 1:]
-    lean = (x1 - x0) / np.where(y1 == y0, 1.0, y1 - y0)
-    crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * lean)
-    return np.logical_xor.reduce(crossed, axis=1)
+    slope = (x1 - x0) / np.where(y1 == y0, 1.0, y1 - y0)
+    crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * slope)
+    return np.asarray(np.logical_xor.reduce(crossed, axis=1))
 
 
 def to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Distance of points ``(n, 2)`` to segments ``(m, 2)``, ``(n, m)``."""
+    """Return the distances of points ``(n, 2)`` to segments ``(m, 2)``, ``(n, m)``."""
     span, gap = ends - starts, points[:, None] - starts
     squared = np.sum(span**2, axis=1)
     along = np.sum(gap * span, axis=2) / np.where(squared > 0, squared, 1.0)
     off = gap - np.clip(along, 0.0, 1.0)[..., None] * span
-    return np.hypot(off[..., 0], off[..., 1])
+    return np.asarray(np.hypot(off[..., 0], off[..., 1]))
 
 
 def crossings(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Tell which segments ``ab`` ``(n, 2)`` cross which ``cd`` ``(m, 2)`` within both."""
+    """Return which segments ``ab`` ``(n, 2)`` cross which ``cd`` ``(m, 2)``, ``(n, m)``."""
     a, b = a[:, None], b[:, None]
 
     def sides(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -121,11 +123,11 @@ def crossings(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.
         return np.where(np.abs(off) <= TOUCH_M, 0.0, np.sign(off))
 
     across = sides(a, b, c) * sides(a, b, d) < 0
-    return across & (sides(c, d, a) * sides(c, d, b) < 0)
+    return np.asarray(across & (sides(c, d, a) * sides(c, d, b) < 0))
 
 
 def meet(a: np.ndarray, b: np.ndarray) -> bool:
-    """Tell whether two outlines touch or cross."""
+    """Return whether two outlines touch or cross."""
     if a.ndim == b.ndim == 1:
         apart = math.dist(a[:2], b[:2])
         return bool(abs(a[2] - b[2]) - TOUCH_M <= apart <= a[2] + b[2] + TOUCH_M)

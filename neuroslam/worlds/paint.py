@@ -1,4 +1,4 @@
-"""Paints surfaces from a seed: masonry, wood, doors, posters, shops, plants, people, sky.
+"""Paints the textures of indoor surfaces from a seed: masonry, wood, doors, posters.
 
 Colours are RGB in 0..255, lengths are metres, heights are above the floor.
 """
@@ -22,16 +22,18 @@ def hue(degrees: float, saturation: float, value: float) -> Colour:
     wheel = (np.array([5.0, 3.0, 1.0]) + degrees / 60.0) % 6.0
     share = np.clip(np.minimum(wheel, 4.0 - wheel), 0.0, 1.0)
     rgb = 255.0 * value * (1.0 - saturation * share)
-    return tuple(round(float(c)) for c in rgb)
+    r, g, b = (round(float(c)) for c in rgb)
+    return r, g, b
 
 
 def darker(colour: Colour, factor: float) -> Colour:
-    """Return ``colour`` times ``factor``, cut at white."""
-    return tuple(min(255, int(c * factor)) for c in colour)
+    """Return ``colour`` times ``factor``, clipped at white."""
+    r, g, b = (min(255, int(c * factor)) for c in colour)
+    return r, g, b
 
 
 def noise(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, float]) -> np.ndarray:
-    """Return smooth noise in about [-1, 1], ``float32 (h, w)``, of a grain (down, across) in px."""
+    """Return smooth noise in about [-1, 1], ``float32 (h, w)``; grain (down, across) in px."""
     total = np.zeros((h, w), dtype=np.float32)
     weight = 0.6
     for octave in range(3):
@@ -43,7 +45,7 @@ def noise(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, float
 
 
 class Canvas:
-    """A wall (or a floor) to paint on: x to the right from its left end, z up from its foot."""
+    """Texture of a wall or floor: x to the right from its left end, z up from its foot."""
 
     def __init__(self, width_m: float, height_m: float, per_m: float, colour: Colour) -> None:
         self.per_m = per_m
@@ -53,11 +55,11 @@ class Canvas:
         self.image[:] = colour
 
     def px(self, x: float, z: float) -> tuple[int, int]:
-        """Return column and row of a point."""
+        """Return column and row of a point in metres."""
         return round(x * self.per_m), round((self.height_m - z) * self.per_m)
 
     def part(self, x0: float, z0: float, x1: float, z1: float) -> np.ndarray:
-        """Return a writable view of a rectangle of the picture (cut at its borders)."""
+        """Return a writable view of a rectangle, clipped at the borders of the image."""
         (left, bottom), (right, top) = self.px(x0, z0), self.px(x1, z1)
         return self.image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
 
@@ -68,7 +70,7 @@ class Canvas:
     def framed(
         self, x0: float, z0: float, x1: float, z1: float, frame: Colour, fill: Colour, edge: float
     ) -> None:
-        """Fill a rectangle within a frame that is ``edge`` metres wide, its lower edge shaded."""
+        """Fill a rectangle with a frame of width ``edge`` in metres and a shadow below."""
         self.rect(x0 - 0.02, z0 - 0.04, x1 + 0.03, z1, darker(frame, 0.45))
         self.rect(x0, z0, x1, z1, frame)
         self.rect(x0 + edge, z0 + edge, x1 - edge, z1 - edge, fill)
@@ -92,7 +94,7 @@ class Canvas:
 
 
 def shade(part: np.ndarray, factor: np.ndarray | float) -> None:
-    """Multiply a piece of a picture by a factor ``(h, w)`` or a number, in place."""
+    """Multiply a part of an image by a factor, ``(h, w)`` or a number, in place."""
     if isinstance(factor, np.ndarray) and factor.ndim == 2:
         factor = factor[..., None]
     part[:] = np.clip(part * factor, 0, 255).astype(np.uint8)
@@ -101,10 +103,11 @@ def shade(part: np.ndarray, factor: np.ndarray | float) -> None:
 def plaster(
     part: np.ndarray, rng: np.random.Generator, colour: Colour, depth: float = 0.05
 ) -> None:
-    """Cover with slightly uneven paint."""
+    """Fill with slightly uneven paint."""
     part[:] = colour
     if part.size:
-        shade(part, 1.0 + depth * noise(rng, *part.shape[:2], (25.0, 40.0)))
+        h, w = part.shape[:2]
+        shade(part, 1.0 + depth * noise(rng, h, w, (25.0, 40.0)))
 
 
 def masonry(
@@ -115,7 +118,7 @@ def masonry(
     spread: float = 0.25,
     staggered: bool = True,
 ) -> None:
-    """Cover with bricks, blocks or tiles of ``stone_px`` (down, across), each of its own shade."""
+    """Fill with bricks, blocks or tiles of ``stone_px`` (down, across), each with its own shade."""
     h, w = part.shape[:2]
     if not part.size:
         return
@@ -137,7 +140,7 @@ def planks(
     plank_px: float,
     spread: float = 0.16,
 ) -> None:
-    """Cover with upright wooden planks."""
+    """Fill with upright wooden planks."""
     h, w = part.shape[:2]
     if not part.size:
         return
@@ -306,9 +309,10 @@ def extinguisher(c: Canvas, rng: np.random.Generator, x: float, z: float = 0.0) 
     return 0.3
 
 
-Thing = Callable[[Canvas, np.random.Generator, float, float], float]
+WallObject = Callable[[Canvas, np.random.Generator, float, float], float]
+"""Paints an object on a canvas at x, z in metres, and returns its width in metres."""
 
-INDOORS: tuple[Thing, ...] = (
+INDOORS: tuple[WallObject, ...] = (
     door,
     poster,
     extinguisher,
@@ -320,8 +324,15 @@ INDOORS: tuple[Thing, ...] = (
     door,
     poster,
 )
-GALLERY: tuple[Thing, ...] = (painting, painting, door, painting, painting, window)
-_WIDEST = {door: 1.35, poster: 1.1, painting: 1.9, board: 1.8, window: 1.75, radiator: 1.15}
+GALLERY: tuple[WallObject, ...] = (painting, painting, door, painting, painting, window)
+_MAX_WIDTH_M: dict[WallObject, float] = {
+    door: 1.35,
+    poster: 1.1,
+    painting: 1.9,
+    board: 1.8,
+    window: 1.75,
+    radiator: 1.15,
+}
 _MARGIN_M = 0.12
 
 
@@ -330,10 +341,10 @@ def interior(
     length_m: float,
     height_m: float,
     per_m: float,
-    things: tuple[Thing, ...] = INDOORS,
+    objects: tuple[WallObject, ...] = INDOORS,
     gap_m: tuple[float, float] = (0.35, 1.0),
 ) -> np.ndarray:
-    """Paint a wall indoors: stretches of plaster, brick and wood, with doors, posters and so on."""
+    """Paint an indoor wall: sections of plaster, brick and wood, with objects on them."""
     c = Canvas(length_m, height_m, per_m, (225, 220, 205))
     at = 0.0
     while at < length_m:
@@ -346,20 +357,21 @@ def interior(
     deck: list[int] = []
     at = rng.uniform(0.2, 0.5)
     while at + 0.3 + _MARGIN_M < length_m:
-        if not deck:  # shuffled like cards, so that no kind of thing is missing for long
-            deck = rng.permutation(len(things)).tolist()
+        if not deck:  # a shuffled deck, so that each kind of object occurs regularly
+            deck = rng.permutation(len(objects)).tolist()
         room = length_m - at - _MARGIN_M
-        fitting = [k for k in deck if _WIDEST.get(things[k], 0.3) <= room]
+        fitting = [k for k in deck if _MAX_WIDTH_M.get(objects[k], 0.3) <= room]
         if not fitting:
             extinguisher(c, rng, at, 0.0)
             break
         deck.remove(fitting[0])
-        at += things[fitting[0]](c, rng, at, 0.0) + rng.uniform(*gap_m)
+        at += objects[fitting[0]](c, rng, at, 0.0) + rng.uniform(*gap_m)
     _light(c, 2.4)
     return c.image
 
 
 def _cover(c: Canvas, rng: np.random.Generator, x0: float, x1: float) -> None:
+    """Paint a section of an indoor wall with a random material."""
     kind = rng.choice(["paint", "two tone", "two tone", "brick", "wood", "dado"])
     part = c.part(x0, 0.0, x1, c.height_m)
     wall = hue(
@@ -385,7 +397,7 @@ def _cover(c: Canvas, rng: np.random.Generator, x0: float, x1: float) -> None:
 
 
 def _light(c: Canvas, spacing_m: float) -> None:
-    """Shade a wall as lamps above would: pools of light, dark corners at floor and ceiling."""
+    """Shade a wall as lit by lamps above: pools of light, dark edges at floor and ceiling."""
     h, w = c.image.shape[:2]
     z = (np.arange(h)[::-1] + 0.5) / c.per_m
     x = (np.arange(w) + 0.5) / c.per_m

@@ -1,4 +1,4 @@
-"""Paints what is outdoors, underfoot or moves: facades, hedges, floors, sky, plants, people."""
+"""Paints facades, hedges, floors, ceilings, sky, plants and people from a seed."""
 
 import math
 
@@ -25,7 +25,7 @@ def facade(
     per_m: float,
     hall: Colour | None = None,
 ) -> np.ndarray:
-    """Paint the front of a house, a shop, or (given its stone's colour) a college hall."""
+    """Paint the front of a house or shop, or of a college hall of the colour ``hall``."""
     stone = hue(rng.uniform(34, 46), rng.uniform(0.15, 0.35), rng.uniform(0.62, 0.82))
     paint = hue(
         rng.choice([8, 30, 42, 52, 95, 190, 210, 350]),
@@ -176,7 +176,7 @@ def _shop(c: Canvas, rng: np.random.Generator, length: float, ground: float) -> 
 
 
 def hedge(rng: np.random.Generator, length_m: float, height_m: float, per_m: float) -> np.ndarray:
-    """Paint a clipped hedge, here and there with blossom, or a garden wall of stone."""
+    """Paint sections of clipped hedge, some with blossom, and of garden wall."""
     c = Canvas(length_m, height_m, per_m, (50, 80, 40))
     at = 0.0
     while at < length_m:
@@ -203,7 +203,7 @@ def hedge(rng: np.random.Generator, length_m: float, height_m: float, per_m: flo
 def floor(
     rng: np.random.Generator, width_m: float, depth_m: float, per_m: float, kind: str
 ) -> Canvas:
-    """Lay a floor or ground: ``carpet``, ``parquet``, ``tiles``, ``asphalt`` or ``grass``."""
+    """Paint a floor or ground: ``carpet``, ``parquet``, ``tiles``, ``asphalt`` or ``grass``."""
     c = Canvas(width_m, depth_m, per_m, (120, 118, 112))
     h, w = c.image.shape[:2]
     if kind == "parquet":
@@ -224,7 +224,7 @@ def floor(
 
 
 def lamps(rng: np.random.Generator, width_m: float, depth_m: float, per_m: float) -> Canvas:
-    """Lay a ceiling of white panels with lamps in a square pattern."""
+    """Paint a ceiling of white panels with a square grid of lamps."""
     c = Canvas(width_m, depth_m, per_m, (205, 204, 198))
     masonry(c.image, rng, (205, 204, 198), (0.6 * per_m, 0.6 * per_m), 0.03, staggered=False)
     for x in np.arange(0.6, width_m, 2.4):
@@ -234,30 +234,30 @@ def lamps(rng: np.random.Generator, width_m: float, depth_m: float, per_m: float
 
 
 def sky(rng: np.random.Generator) -> np.ndarray:
-    """Paint the sky all around, ``(256, 1536, 3)``, from the horizon to 45 degrees above it."""
+    """Paint a panorama of the sky, ``(256, 1536, 3)``, from the horizon to 45 degrees above it."""
     h, w = 256, 1536
     up = np.linspace(1.0, 0.0, h)[:, None, None]
     image = (1.0 - up) * np.array([206, 222, 236.0]) + up * np.array([88, 142, 214.0])
     cloud = _around(rng, h, w, (70.0, 170.0))
     cloud = np.clip(2.4 * cloud - 0.35, 0.0, 0.9)[..., None]
-    image = image * (1.0 - cloud) + 250.0 * cloud
+    image = np.asarray(image * (1.0 - cloud) + 250.0 * cloud)
     for height, colour in ((30.0, (136, 158, 172)), (14.0, (92, 124, 98))):
         ridge = height * (1.0 + 0.6 * _around(rng, 1, w, (1.0, 60.0))[0])
         image[np.arange(h)[::-1, None] < ridge[None]] = colour
-    return np.clip(image, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(image, 0, 255).astype(np.uint8))
 
 
 def _around(rng: np.random.Generator, h: int, w: int, grain_px: tuple[float, float]) -> np.ndarray:
-    """Return smooth noise whose left and right ends meet."""
+    """Return smooth noise that wraps around from the right to the left end."""
     lap = w // 6
-    long = noise(rng, h, w + lap, grain_px)
-    meet = np.linspace(0.0, 1.0, lap, dtype=np.float32)
-    long[:, w:] = long[:, w:] * (1.0 - meet) + long[:, :lap] * meet
-    return long[:, lap:]
+    wide = noise(rng, h, w + lap, grain_px)
+    blend = np.linspace(0.0, 1.0, lap, dtype=np.float32)
+    wide[:, w:] = wide[:, w:] * (1.0 - blend) + wide[:, :lap] * blend
+    return np.asarray(wide[:, lap:])
 
 
-def _cut(image: np.ndarray) -> np.ndarray:
-    """Return a painted RGBA picture, drawn at double size, at its size."""
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    """Shrink an RGBA image that was drawn at double size."""
     return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
@@ -280,11 +280,11 @@ def plant(rng: np.random.Generator) -> np.ndarray:
     shape = np.array([[40, 225], [100, 225], [90, 298], [50, 298]], dtype=np.int32)
     cv2.fillPoly(image, [shape], pot, cv2.LINE_AA)
     cv2.rectangle(image, (36, 222), (104, 236), (*darker(pot[:3], 0.8), 255), -1)
-    return _cut(image)
+    return _shrunk(image)
 
 
 def tree(rng: np.random.Generator) -> np.ndarray:
-    """Paint a tree, ``uint8 (h, w, 4)``, as wide as two thirds of its height."""
+    """Paint a tree, ``uint8 (h, w, 4)``, whose width is two thirds of its height."""
     image = np.zeros((480, 320, 4), dtype=np.uint8)
     cv2.rectangle(image, (148, 250), (172, 479), (92, 70, 52, 255), -1)
     for dx in (-60, 50):
@@ -296,11 +296,11 @@ def tree(rng: np.random.Generator) -> np.ndarray:
         light = 0.3 + 0.3 * (i / 90) + 0.12 * (165 - at[1]) / 110
         tone = (*hue(green + rng.uniform(-14, 14), 0.6, min(max(light, 0.2), 0.8)), 255)
         cv2.circle(image, at, int(rng.uniform(16, 34)), tone, -1, cv2.LINE_AA)
-    return _cut(image)
+    return _shrunk(image)
 
 
 def person(rng: np.random.Generator) -> list[np.ndarray]:
-    """Paint a walker seen from ahead, four phases of a stride, each 0.8 m wide and 1.8 m high."""
+    """Paint a pedestrian from the front in four phases of a stride, 0.8 m wide and 1.8 m high."""
     coat, legs = (hue(rng.uniform(0, 360), rng.uniform(0.3, 0.8), v) for v in (0.6, 0.3))
     skin = hue(rng.uniform(18, 30), rng.uniform(0.3, 0.65), rng.uniform(0.4, 0.9))
     hair = hue(rng.uniform(15, 45), 0.5, rng.uniform(0.1, 0.6))
@@ -325,5 +325,5 @@ def person(rng: np.random.Generator) -> list[np.ndarray]:
         cv2.ellipse(image, (96, 32), (27, 26), 0, 180, 360, (*hair, 255), -1, cv2.LINE_AA)
         for eye in (87, 105):
             cv2.circle(image, (eye, 43), 3, (30, 26, 24, 255), -1, cv2.LINE_AA)
-        cycle.append(_cut(image))
+        cycle.append(_shrunk(image))
     return cycle

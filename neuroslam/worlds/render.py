@@ -1,4 +1,4 @@
-"""Draws a world as a camera sees it: one ray per column, whole rows and columns at once."""
+"""Renders a world for a camera: one ray per column, in operations on whole arrays."""
 
 import math
 from collections.abc import Sequence
@@ -9,31 +9,31 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from neuroslam.geometry import TWO_PI
+from neuroslam.geometry import TWO_PI, rotation_matrix
 from neuroslam.types import Pose
 from neuroslam.worlds.atlas import LEVELS_GROUND, LEVELS_U, LEVELS_V, Atlas
 from neuroslam.worlds.scene import Billboard, Surface, World
 
-_NEVER = 1e6  # depth (m) of a ray that hits nothing
-_NEAR_M = 0.15  # figures nearer than this are inside the camera
-_FINE = 2  # rows drawn per row delivered: slanted edges become smooth
+_NO_HIT = 1e6  # depth (m) of a ray that hits nothing
+_NEAR_M = 0.15  # nearer figures are not drawn
+_FINE = 2  # rows rendered per row of the image, so that slanted edges are smooth
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A level camera. Forward is the middle column; the left half of the picture is to the left.
+    """A level camera whose middle column looks ahead; the left half of the image shows the left.
 
-    A point at ``depth`` along a column's ray and ``z`` above the camera is seen ``focal_px * z /
-    depth`` pixels above the horizon. Pinhole: depth is along the axis, columns are equally wide on
-    a plane. Panoramic: depth is the distance, columns are equal angles through the full turn.
+    A point at ``depth`` along a column's ray and ``z`` above the camera is ``focal_px * z / depth``
+    pixels above the horizon. Pinhole: depth is measured along the axis, columns are equally wide on
+    a plane. Panoramic: depth is the distance, columns are equal angles of the full turn.
 
     Attributes:
-        width: Columns.
-        height: Rows.
+        width: Number of columns.
+        height: Number of rows.
         fov_deg: Horizontal field of view; ignored if panoramic.
-        panoramic: Sees the full turn on a cylinder.
+        panoramic: Whether the image is a cylindrical panorama of the full turn.
         camera_height_m: Height above the floor.
-        horizon: Row of the horizon as a share of the height, from the top.
+        horizon: Row of the horizon as a fraction of the height, from the top.
 
     Example:
         >>> Camera(width=160, height=60, fov_deg=90.0).focal_px
@@ -49,14 +49,14 @@ class Camera:
 
     @cached_property
     def focal_px(self) -> float:
-        """Pixels per unit of slope."""
+        """Focal length in pixels: pixels per unit of slope."""
         if self.panoramic:
             return self.width / TWO_PI
         return round(0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2.0), 9)
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """Direction of each column, robot's axes (x forward, y left), ``(width, 2)``, depth 1."""
+        """Ray of each column at depth 1, ``(width, 2)``, in the robot's axes: x forward, y left."""
         right = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_px
         if self.panoramic:
             return np.column_stack([np.cos(right), -np.sin(right)])
@@ -64,16 +64,20 @@ class Camera:
 
     @cached_property
     def slopes(self) -> np.ndarray:
-        """Slope of each fine row, up positive, ``float32 (_FINE * height,)``."""
+        """Slope of each rendered row, positive upwards, ``float32 (_FINE * height,)``."""
         rows = (np.arange(_FINE * self.height) + 0.5) / _FINE
         return ((self.horizon * self.height - rows) / self.focal_px).astype(np.float32)
 
 
 class Hits(NamedTuple):
-    """What each column's ray meets, each of shape ``(width,)``.
+    """The surface that the ray of each column hits; all arrays have shape ``(width,)``.
 
-    ``depth`` in units of the ray; ``strip`` which picture; ``along_m`` where on it; ``slant`` the
-    sine of the angle between ray and surface times the ray's length; ``top_m`` height of the thing.
+    Attributes:
+        depth: Depth of the hit in units of the ray.
+        strip: Texture of the surface.
+        along_m: Position on the texture.
+        slant: Sine of the angle between ray and surface, times the length of the ray.
+        top_m: Height of the surface.
     """
 
     depth: np.ndarray
@@ -90,20 +94,19 @@ def render(
     figures: Sequence[Billboard] = (),
     gain: float = 1.0,
 ) -> np.ndarray:
-    """Draw what a camera at ``pose`` sees.
+    """Render the image of a camera.
 
     Args:
         world: The world.
-        pose: Where the camera is: metres, metres, radians.
-        camera: Its optics.
-        figures: Figures besides the world's own, such as passers-by at this moment.
-        gain: Factor on all grey levels, cut at white.
+        pose: Pose of the camera: metres, metres, radians.
+        camera: The camera.
+        figures: Figures in addition to those of the world, such as pedestrians.
+        gain: Factor on all grey levels, clipped at white.
 
     Returns:
         ``uint8 (height, width, 3)``, RGB.
     """
-    c, s = math.cos(pose.theta_rad), math.sin(pose.theta_rad)
-    rays = camera.rays @ np.array([[c, s], [-s, c]])
+    rays = camera.rays @ rotation_matrix(pose.theta_rad).T
     layers = cast(world, pose, rays, camera.camera_height_m)
     length = np.hypot(rays[:, 0], rays[:, 1]).astype(np.float32)
     slopes = camera.slopes[:, None]
@@ -134,38 +137,39 @@ def render(
 
 
 def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]:
-    r"""Find what rays meet: the nearest wall or pillar, and the one that reaches highest.
+    r"""Find the surfaces that rays hit: the nearest wall or pillar, and the visibly highest one.
 
-    A ray :math:`p + t d` meets the wall :math:`a + q e` where, with :math:`a` seen from :math:`p`,
+    A ray :math:`p + t d` hits the wall :math:`a + q e`, with :math:`a` relative to :math:`p`, at
     :math:`t = (a \times e) / (d \times e)` and :math:`q = (a \times d) / (d \times e)`.
 
     Args:
         world: The world.
-        pose: Where the rays start; their directions are given, its heading is not used.
+        pose: Origin of the rays; its heading is not used.
         rays: Directions in the world's axes, shape ``(n, 2)``.
         eye_m: Height of the rays above the floor.
 
     Returns:
-        The nearest hits, as the last of the list; before them, where tops differ, those of the
-        highest elevation, which may be seen above the nearest.
+        The nearest hits, as the last item. If the surfaces differ in height, an item before it has
+        the hits of highest elevation, which may be visible above the nearest.
     """
     at = np.array([pose.x_m, pose.y_m])
     start = world.walls[:, :2] - at
     edge = world.walls[:, 2:] - world.walls[:, :2]
     across = start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]
-    seen = across < 0.0  # the rest show their backs
+    visible = across < 0.0  # the others are seen from behind
     middle = rays[len(rays) // 2]
-    if np.all(rays @ middle > 0.0):  # no ray points backward: what is all behind is out of sight
+    if np.all(rays @ middle > 0.0):  # all rays point forwards: walls behind are not visible
         ahead = np.maximum(start @ middle, (start + edge) @ middle)
-        seen &= ahead > 0.0
-    index = np.flatnonzero(seen) if seen.any() else np.zeros(1, dtype=int)
+        visible &= ahead > 0.0
+    index = np.flatnonzero(visible) if visible.any() else np.zeros(1, dtype=int)
     start, edge, across = start[index], edge[index], across[index]
     x, y = rays[:, :1], rays[:, 1:]
     below = np.minimum(x * edge[:, 1] - y * edge[:, 0], -1e-12)
     share = start[:, 0] * y - start[:, 1] * x
-    meets = (share <= 1e-9) & (share >= below - 1e-9) & (across < 0.0)
-    depth = np.where(meets, across / below, _NEVER)
+    hits = (share <= 1e-9) & (share >= below - 1e-9) & (across < 0.0)
+    depth = np.where(hits, across / below, _NO_HIT)
     strip = world.wall_strips[index]
+    root = np.empty((len(rays), 0))
     if len(world.pillars):
         toward = rays @ (world.pillars[:, :2] - at).T
         off = x * (world.pillars[:, 1] - at[1]) - y * (world.pillars[:, 0] - at[0])
@@ -173,7 +177,7 @@ def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]
         inside = square * world.pillars[:, 2] ** 2 - off * off
         root = np.sqrt(np.maximum(inside, 0.0))
         reach = (toward - root) / square
-        reach = np.where((inside > 0.0) & (reach > 0.0), reach, _NEVER)
+        reach = np.where((inside > 0.0) & (reach > 0.0), reach, _NO_HIT)
         depth = np.hstack([depth, reach])
         strip = np.concatenate([strip, world.pillar_strips])
 
@@ -189,14 +193,14 @@ def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]
         slant = -below[column, wall] / lengths[wall]
         if len(world.pillars):
             pillar = which - len(index)
-            round_ = pillar >= 0
+            is_pillar = pillar >= 0
             p = world.pillars[np.maximum(pillar, 0)]
             hit = at + t[:, None] * rays - p[:, :2]
             angle = np.arctan2(hit[:, 1], hit[:, 0]) + math.pi
-            along = np.where(round_, angle * p[:, 2], along)
-            slant = np.where(round_, root[column, np.maximum(pillar, 0)] / p[:, 2], slant)
+            along = np.where(is_pillar, angle * p[:, 2], along)
+            slant = np.where(is_pillar, root[column, np.maximum(pillar, 0)] / p[:, 2], slant)
         return Hits(
-            t, strip[which], along, np.maximum(slant, 1e-3), np.where(t < _NEVER, top[which], 0.0)
+            t, strip[which], along, np.maximum(slant, 1e-3), np.where(t < _NO_HIT, top[which], 0.0)
         )
 
     near = describe(np.argmin(depth, axis=1))
@@ -206,21 +210,21 @@ def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]
 
 
 def measure_ranges(world: World, pose: Pose, n_beams: int, eye_m: float) -> np.ndarray:
-    """Return what a scanner measures: distances to walls and pillars, without noise.
+    """Return the ranges of a laser scanner: distances to walls and pillars, without noise.
 
     Args:
         world: The world.
-        pose: Of the scanner.
-        n_beams: Beams, evenly over the full turn, counter-clockwise from straight ahead.
-        eye_m: Its height above the floor.
+        pose: Pose of the scanner.
+        n_beams: Number of beams, evenly over the full turn, counter-clockwise from ahead.
+        eye_m: Height of the scanner above the floor.
 
     Returns:
-        Metres, ``(n_beams,)``; ``inf`` where nothing is met.
+        Metres, ``(n_beams,)``; ``inf`` where a beam hits nothing.
     """
-    angle = pose.theta_rad + 2.0 * math.pi * np.arange(n_beams) / n_beams
+    angle = pose.theta_rad + TWO_PI * np.arange(n_beams) / n_beams
     rays = np.column_stack([np.cos(angle), np.sin(angle)])
     depth = cast(world, pose, rays, eye_m)[-1].depth
-    return np.where(depth < _NEVER, depth, np.inf)
+    return np.where(depth < _NO_HIT, depth, np.inf)
 
 
 def _draw_upright(
@@ -232,7 +236,7 @@ def _draw_upright(
     rows: np.ndarray,
     clear: np.ndarray,
 ) -> None:
-    """Enter, for every pixel of these walls, where in the atlas it is and how far away."""
+    """Write, for every pixel of these walls, its position in the atlas and its distance."""
     per_m = atlas.strip_per_m[hits.strip]
     per_column = per_m * hits.depth / (camera.focal_px * hits.slant)
     per_row = per_m * hits.depth / (_FINE * camera.focal_px)
@@ -262,8 +266,9 @@ def _draw_flat(
     columns: np.ndarray,
     rows: np.ndarray,
 ) -> None:
-    """Enter, for the rows of ``part``, where in the atlas their floor or ceiling is."""
-    tiles = world.atlas.ground if surface is world.ground else world.atlas.ceiling
+    """Write, for the rows of ``part``, the position of their floor or ceiling in the atlas."""
+    ceiling = world.atlas.ceiling
+    tiles = world.atlas.ground if ceiling is None or surface is world.ground else ceiling
     slopes = camera.slopes[part].astype(float)
     rise = surface.height_m - camera.camera_height_m
     depth = rise / slopes
@@ -287,6 +292,9 @@ def _draw_sky(
     columns: np.ndarray,
     rows: np.ndarray,
 ) -> None:
+    """Write, for the rows above the horizon, the position of their sky in the atlas."""
+    if atlas.sky is None:
+        return
     left, top, width, height = atlas.sky
     turn = (math.pi - np.arctan2(rays[:, 1], rays[:, 0])) / TWO_PI
     columns[: len(slopes)] = left - 0.5 + turn * width
@@ -303,7 +311,7 @@ def _draw_figures(
     figures: Sequence[Billboard],
     layers: list[Hits],
 ) -> None:
-    """Blend figures into the fine image, the farthest first, where no wall hides them."""
+    """Blend figures into the rendered rows, farthest first, where no wall hides them."""
     every = [*world.billboards, *figures]
     if not every:
         return
@@ -311,7 +319,7 @@ def _draw_figures(
     dx, dy = table[:, 0] - pose.x_m, table[:, 1] - pose.y_m
     distance = np.maximum(np.hypot(dx, dy), 1e-9)
     dx, dy = dx / distance, dy / distance
-    # A figure faces the camera: its plane is square to the line of sight to its middle.
+    # A figure faces the camera: its plane is perpendicular to the line of sight to its middle.
     toward = rays[:, :1] * dx + rays[:, 1:] * dy
     depth = distance / np.maximum(toward, 0.05)
     aside = depth * (rays[:, :1] * dy - rays[:, 1:] * dx)
@@ -325,7 +333,8 @@ def _draw_figures(
         columns = np.flatnonzero(shown[:, i])
         if len(columns):
             ahead, across = depth[columns, i], aside[columns, i]
-            _blend(image, world, camera, every[i], distance[i], columns, ahead, across, layers)
+            far = float(distance[i])
+            _blend(image, world, camera, every[i], far, columns, ahead, across, layers)
 
 
 def _blend(
@@ -339,7 +348,7 @@ def _blend(
     aside: np.ndarray,
     layers: list[Hits],
 ) -> None:
-    """Blend one figure into the given columns of the fine image."""
+    """Blend one figure into some columns of the rendered rows."""
     eye = camera.camera_height_m
     downward = -camera.slopes
     nearest = depth.min()
@@ -349,20 +358,20 @@ def _blend(
 
     levels = world.figure_levels[figure.cutout]
     per_row = levels[0].shape[0] / figure.height_m * distance / (_FINE * camera.focal_px)
-    picture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
-    h, w = picture.shape[:2]
+    texture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
+    h, w = texture.shape[:2]
     v = (figure.height_m - eye - slope * depth) * (h / figure.height_m) - 0.5
     v = v.astype(np.float32)
     u = np.empty_like(v)
     u[:] = (aside / figure.width_m + 0.5) * w - 0.5
-    patch = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    patch = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     patch = patch.astype(np.float32)
     for hits in layers:
         wall = hits.depth[columns]
         patch[(depth > wall) & (slope <= (hits.top_m[columns] - eye) / wall)] = 0.0
 
     fade = math.exp(-distance / world.sight_m)
-    tint = np.zeros((3, 4))  # colours are already times opacity, the fourth channel
+    tint = np.zeros((3, 4))  # colours are premultiplied by opacity, the fourth channel
     tint[:, :3] = np.eye(3) * fade
     tint[:, 3] = np.array(world.haze) * ((1.0 - fade) / 255.0)
     veil = np.zeros((3, 5))

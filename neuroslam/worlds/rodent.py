@@ -1,8 +1,8 @@
-"""Walks of rats, recorded or made: where an animal was, and the walls around it.
+"""Walks of rats, recorded or simulated: positions over time, and the arena around them.
 
 A recorded walk is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the times
-``t``, ``(n,)`` in seconds; it may have the corners of its arena, ``vertices``, or its
-``arena_radius``, and the times ``spikes_s`` of a cell that was recorded with it. Or it is a CSV
+``t``, ``(n,)`` in seconds. Optional are the corners of the arena, ``vertices``, or its
+``arena_radius``, and the spike times ``spikes_s`` of a cell recorded with it. Or the walk is a CSV
 with the columns ``time_s``, ``x_m`` and ``y_m``.
 """
 
@@ -12,24 +12,25 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from neuroslam.errors import ConfigError, SourceError
-from neuroslam.geometry import TWO_PI
+from neuroslam.geometry import TWO_PI, rotate
 from neuroslam.sensors.images import read_text
-from neuroslam.sensors.tracks import Clock, motion_along, parse_table, read_positions
+from neuroslam.sensors.tracks import motion_along, parse_table, read_positions, rising
 from neuroslam.worlds.arena import Arena
 
 ARENA_KEYS = ("vertices", "arena_radius")
-"""The arrays of a track's file that describe its arena; either will do."""
+"""Arrays of a track's file that describe its arena; either is sufficient."""
 
 _TABLE = ("time_s", "x_m", "y_m")
 
-# The agent of roam. Speed is Rayleigh distributed, as that of rats in the open field is.
-_SPEED_TIME_S = 0.7  # over which it forgets its speed
-_TURN_TIME_S = 0.2  # over which it forgets its turn rate
+# The agent of roam(). Its speed is Rayleigh distributed, as that of rats in the open field.
+_SPEED_TIME_S = 0.7  # time constant of the speed
+_TURN_TIME_S = 0.2  # time constant of the turn rate
 _TURN_RAD_S = 0.8  # standard deviation of the turn rate
-_STEER_M = 0.12  # nearer walls are steered along
-_CELL_M = 0.01  # of the grid on which the distance to the walls is looked up
+_STEER_M = 0.12  # distance below which the agent is steered along a wall
+_CELL_M = 0.01  # cell of the grid of distances to the walls
 _MAX_CELLS = 400_000
 _ESCAPES = [s * math.radians(a) for a in range(20, 181, 20) for s in (1.0, -1.0)]
 
@@ -39,13 +40,13 @@ class Walk:
     """Positions of an animal over time.
 
     Attributes:
-        name: Where it comes from, for messages.
-        times_s: ``(n,)``, rising, n at least 2.
+        name: Name of the walk, for messages.
+        times_s: Rising times in seconds, ``(n,)``, n at least 2.
         positions: ``(n, 2)`` in metres.
-        headings_rad: Direction of the step into each position, ``(n,)``; who stands keeps it.
-        arena: The walls around it, or ``None`` if they are not known.
-        spikes_s: Times at which a cell fired, ``(m,)``, or ``None``.
-        n_dropped: Rows of the file that were left out: no number, or a time that did not rise.
+        headings_rad: Direction of the step to each position, ``(n,)``; without a step it stays.
+        arena: The arena, or ``None`` if it is not known.
+        spikes_s: Spike times of a cell in seconds, ``(m,)``, or ``None``.
+        n_dropped: Number of dropped rows of the file: no number, or a time that does not rise.
     """
 
     name: str
@@ -58,46 +59,46 @@ class Walk:
 
     @classmethod
     def along(
-        cls, name: str, times_s: np.ndarray, positions: np.ndarray, arena: Arena | None = None
+        cls, name: str, times_s: ArrayLike, positions: ArrayLike, arena: Arena | None = None
     ) -> Self:
-        """Make a walk of times and positions; the headings follow.
+        """Make a walk of times and positions, from which the headings are derived.
 
         Raises:
-            SourceError: If there are fewer than two, or one is not finite, or a time not rising.
+            SourceError: If there are fewer than two, one is not finite, or a time does not rise.
 
         Example:
             >>> walk = Walk.along("step", np.array([0.0, 0.5]), np.array([[0.0, 0.0], [0.0, 1.0]]))
             >>> walk.headings_rad.round(2).tolist()
             [1.57, 1.57]
         """
-        times_s, positions = np.asarray(times_s, np.float64), np.asarray(positions, np.float64)
-        n = len(times_s)
-        if n < 2 or positions.shape != (n, 2):
+        t, p = np.asarray(times_s, np.float64), np.asarray(positions, np.float64)
+        n = len(t)
+        if n < 2 or p.shape != (n, 2):
             raise SourceError(
-                f"{name}: times have shape {times_s.shape}, positions {positions.shape}; "
+                f"{name}: times have shape {t.shape}, positions {p.shape}; "
                 "expected (n,) and (n, 2), n at least 2"
             )
-        if not (np.isfinite(positions).all() and np.isfinite(times_s).all()):
-            raise SourceError(f"{name}: not all its times and positions are finite; drop the rest")
-        if not (np.diff(times_s) > 0.0).all():
-            raise SourceError(f"{name}: its times do not rise; sort them and drop doubles")
-        return cls(name, times_s, positions, motion_along(times_s, positions)[1][:, 2], arena)
+        if not (np.isfinite(p).all() and np.isfinite(t).all()):
+            raise SourceError(f"{name}: a time or position is not finite; drop such rows")
+        if not (np.diff(t) > 0.0).all():
+            raise SourceError(f"{name}: times do not rise; sort them, and drop duplicates")
+        return cls(name, t, p, motion_along(t, p)[1][:, 2], arena)
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first to the last position."""
+        """Time from the first to the last position in seconds."""
         return float(self.times_s[-1] - self.times_s[0])
 
     @property
     def rate_hz(self) -> float:
-        """Positions per second: one over the median interval."""
+        """Positions per second: the inverse of the median interval."""
         return 1.0 / float(np.median(np.diff(self.times_s)))
 
     def resampled(self, rate_hz: float) -> Self:
-        """Return the walk at this rate, positions interpolated along straight lines.
+        """Return the walk at another rate, with positions interpolated linearly.
 
         Raises:
-            SourceError: If the rate is not above 0, or leaves fewer than two positions.
+            SourceError: If the rate is not positive, or results in fewer than two positions.
 
         Example:
             >>> walk = Walk.along("step", [0.0, 1.0], [[0.0, 0.0], [4.0, 0.0]])
@@ -108,16 +109,15 @@ class Walk:
         n = math.floor(self.duration_s * rate_hz * (1.0 + 1e-12) + 1e-9) + 1
         times_s = self.times_s[0] + np.arange(n) / rate_hz
         positions = np.column_stack([np.interp(times_s, self.times_s, p) for p in self.positions.T])
-        return self._with(times_s, positions, self.spikes_s)
+        return self._replaced(times_s, positions, self.spikes_s)
 
     def lasting(self, minutes: float) -> Self:
-        """Return the walk forward, reversed, forward and so on, cut to this length.
+        """Return the walk forwards, backwards, forwards and so on, cut to a duration.
 
-        Spikes are kept while the walk goes forward for the first time; of a longer walk they would
-        be too few, and there are none.
+        Spikes are only kept if the first pass forwards is long enough.
 
         Raises:
-            SourceError: If the length is not above 0, or leaves fewer than two positions.
+            SourceError: If the duration is not positive, or results in fewer than two positions.
 
         Example:
             >>> walk = Walk.along("step", [0.0, 2.0, 3.0], [[0.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
@@ -143,25 +143,27 @@ class Walk:
         spikes = self.spikes_s if passes == 1 else None
         if spikes is not None:
             spikes = spikes[spikes <= self.times_s[0] + wanted_s]
-        return self._with(self.times_s[0] + times_s[keep], self.positions[index[keep]], spikes)
+        return self._replaced(self.times_s[0] + times_s[keep], self.positions[index[keep]], spikes)
 
-    def _with(self, times_s: np.ndarray, positions: np.ndarray, spikes: np.ndarray | None) -> Self:
+    def _replaced(
+        self, times_s: np.ndarray, positions: np.ndarray, spikes: np.ndarray | None
+    ) -> Self:
         made = type(self).along(self.name, times_s, positions, self.arena)
         return replace(made, spikes_s=spikes, n_dropped=self.n_dropped)
 
 
 def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | None = None) -> Walk:
-    """Read a recorded walk, as the head of this module describes it.
+    """Read a recorded walk; the module's docstring describes its format.
 
-    Rows without numbers, or whose time is not later than all before, are dropped and counted.
+    Rows without numbers, or with a time that is not later than all before, are dropped and counted.
 
     Args:
         path: An ``.npz`` or a CSV.
-        minutes: Length to bring it to, see :meth:`Walk.lasting`; ``None``: as it is.
-        rate_hz: Rate to bring it to before, see :meth:`Walk.resampled`; ``None``: as it is.
+        minutes: Duration of the result, see :meth:`Walk.lasting`; ``None``: unchanged.
+        rate_hz: Rate before that, see :meth:`Walk.resampled`; ``None``: unchanged.
 
     Raises:
-        SourceError: If it is missing, damaged, or has fewer than two usable rows.
+        SourceError: If the file is missing, damaged, or has fewer than two usable rows.
     """
     path = Path(path)
     if not path.is_file():
@@ -174,19 +176,20 @@ def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | N
             read_text(path), str(path), _TABLE, f"expected {','.join(_TABLE)}: seconds and metres"
         )
         times_s, positions = table["time_s"], np.column_stack([table["x_m"], table["y_m"]])
-    good = np.isfinite(positions).all(axis=1)
-    # A time far ahead on a row without a position must not make all later times too early.
-    times_s = np.where(good, times_s, np.nan)
-    good &= Clock(str(path), times_s, 1.0).usable
-    n = int(good.sum())
+    if times_s is None:
+        raise SourceError(f"{path}: has no times; expected t (n,) in seconds")
+    usable = np.isfinite(positions).all(axis=1)
+    # The time of a row without a position does not count, so it cannot invalidate later rows.
+    times_s = np.where(usable, times_s, np.nan)
+    usable &= rising(times_s)
+    n = int(usable.sum())
     if n < 2:
         raise SourceError(
-            f"{path}: {n} of its {len(good)} rows have numbers and a time that rises; "
-            "expected two or more"
+            f"{path}: {n} of {len(usable)} rows have numbers and a rising time; expected at least 2"
         )
     arena = Arena.from_arrays(arrays) if any(key in arrays for key in ARENA_KEYS) else None
-    walk = Walk.along(str(path), times_s[good], positions[good], arena)
-    walk = replace(walk, spikes_s=_spikes(arrays, path), n_dropped=len(good) - n)
+    walk = Walk.along(str(path), times_s[usable], positions[usable], arena)
+    walk = replace(walk, spikes_s=_spikes(arrays, path), n_dropped=len(usable) - n)
     walk = walk if rate_hz is None else walk.resampled(rate_hz)
     return walk if minutes is None else walk.lasting(minutes)
 
@@ -198,25 +201,25 @@ def roam(
     rate_hz: float = 20.0,
     speed_m_s: float = 0.08,
 ) -> Walk:
-    r"""Let an agent walk about in an arena as a foraging rat does.
+    r"""Simulate the walk of a foraging rat in an arena.
 
-    Its speed is the length of a planar Ornstein-Uhlenbeck process, so it is smooth and Rayleigh
-    distributed; its turn rate is another one. Near a wall it is steered along it,
+    The speed is the norm of a planar Ornstein-Uhlenbeck process, so it is smooth and Rayleigh
+    distributed; the turn rate is another such process. Near a wall the agent is steered along it,
 
     .. math:: d\theta = \pm \frac{ds}{R - m} \, (-n \cdot h)_+
 
     with :math:`R` the distance, :math:`n` the normal, :math:`h` the heading and :math:`m` the
-    distance it never goes below (0.02 m; more where the arena is larger than 6 m).
+    smallest distance allowed (0.02 m; more if the arena is larger than 6 m).
 
     Args:
-        arena: Where.
-        minutes: How long.
-        generator: Of its randomness.
+        arena: The arena.
+        minutes: Duration.
+        generator: Source of randomness.
         rate_hz: Positions per second.
         speed_m_s: Mean speed.
 
     Raises:
-        SourceError: If a number is not above 0, or the arena has no room for it.
+        SourceError: If a number is not positive, or the arena is too narrow.
 
     Example:
         >>> walk = roam(Arena.circle(1.0), 0.1, np.random.default_rng(0))
@@ -231,14 +234,14 @@ def roam(
         _above_0(arena.name, what, value, unit)
     room = _Room(arena)
     spread = speed_m_s / math.sqrt(math.pi / 2.0)
-    # So many steps a sample that hardly any is cut by the bound below.
+    # Enough steps per sample that the bound below shortens hardly any of them.
     fine = max(1, math.ceil(4.0 * spread / (rate_hz * room.margin_m)))
     n = max(1, round(60.0 * minutes * rate_hz)) * fine
     dt = 1.0 / (rate_hz * fine)
     times_s = np.arange(n + 1) * dt
     normals = generator.standard_normal((3, n + 1))
     planar = ornstein_uhlenbeck(normals[:2], times_s, _SPEED_TIME_S)
-    # Longer steps could pass through a wall from one side of the margin to the other.
+    # A step longer than the margin could pass through a wall.
     lengths = np.minimum(spread * dt * np.hypot(*planar), room.margin_m)[1:]
     turns = _TURN_RAD_S * dt * ornstein_uhlenbeck(normals[2], times_s, _TURN_TIME_S)[1:]
     x, y = room.free[generator.integers(len(room.free))].tolist()
@@ -251,10 +254,10 @@ def roam(
 
 
 class _Room:
-    """An arena's distance to the nearest wall on a grid, negative outside, and steps in it.
+    """Distances to the nearest wall of an arena on a grid, negative outside, and steps in it.
 
-    The distance changes by no more than one metre a metre, so between the nodes it is right to
-    0.71 cells, and a place said to be two cells from the walls is at least 1.29 cells from them.
+    The distance changes by at most one metre per metre, so its interpolation is accurate to 0.71
+    cells, and a position at two cells from the walls is at least 1.29 cells from them.
     """
 
     def __init__(self, arena: Arena) -> None:
@@ -276,14 +279,14 @@ class _Room:
         self.free = grid[distance >= 1.5 * self.margin_m]
         if not len(self.free):
             raise SourceError(
-                f"{arena.name}: no place in it is {1.5 * self.margin_m:g} m from its walls; "
-                "expected a larger arena"
+                f"{arena.name}: no position is {1.5 * self.margin_m:g} m from its walls; expected "
+                "a larger arena"
             )
-        # Lists: single numbers come out of them five times as fast as out of arrays.
+        # Nested lists: reading single numbers is five times as fast as from an array.
         self.distance_m = distance.reshape(nx, ny).tolist()
 
-    def look(self, x: float, y: float) -> tuple[float, float, float]:
-        """Return the distance to the nearest wall and its gradient, which leads away from it."""
+    def distance_at(self, x: float, y: float) -> tuple[float, float, float]:
+        """Return the distance to the nearest wall, and its gradient, which points away from it."""
         u, v = (x - self.low[0]) / self.cell_m, (y - self.low[1]) / self.cell_m
         i, j = int(u), int(v)
         a, b = u - i, v - j
@@ -295,41 +298,40 @@ class _Room:
         return low + (d10 + (d11 - d10) * b - low) * a, gx, gy
 
     def step(self, x: float, y: float, theta: float, length: float) -> tuple[float, float, float]:
-        """Go one step, steered along the walls; where no direction is free, only turn."""
-        distance, gx, gy = self.look(x, y)
-        c, s = math.cos(theta), math.sin(theta)
-        nearing = -(c * gx + s * gy)
-        side = 1.0 if c * gy - s * gx > 0.0 else -1.0  # where the way along the wall is shorter
-        if distance < _STEER_M and nearing > 0.0:
+        """Take one step, steered along the walls; if no direction is free, only turn."""
+        distance, gx, gy = self.distance_at(x, y)
+        ahead, left = rotate(gx, gy, -theta)  # the gradient in the agent's frame
+        approach = -ahead
+        side = 1.0 if left > 0.0 else -1.0  # side to which the smaller turn is away from the wall
+        if distance < _STEER_M and approach > 0.0:
             room = max(distance - self.margin_m, 0.1 * self.cell_m)
-            theta += side * min(length / room, 1.0) * nearing
+            theta += side * min(length / room, 1.0) * approach
         for escape in (0.0, *_ESCAPES):
-            turned = theta + side * escape
-            to_x, to_y = x + length * math.cos(turned), y + length * math.sin(turned)
-            if self.look(to_x, to_y)[0] >= self.margin_m:
-                return to_x, to_y, turned % TWO_PI
+            heading = theta + side * escape
+            to_x, to_y = x + length * math.cos(heading), y + length * math.sin(heading)
+            if self.distance_at(to_x, to_y)[0] >= self.margin_m:
+                return to_x, to_y, heading % TWO_PI
         return x, y, (theta + side) % TWO_PI
 
 
 def ratinabox_walk(arena: Arena, minutes: float, seed: int, rate_hz: float = 20.0) -> Walk:
-    """Let an agent of RatInABox (George et al. 2024) walk about in an arena; the extra ``rodent``.
+    """Simulate a walk with RatInABox (George et al. 2024); needs the extra ``rodent``.
 
     Args:
-        arena: Where; circles are given to it as polygons.
-        minutes: How long.
-        seed: Of its randomness. RatInABox draws from numpy's global generator, whose state is put
-            back afterwards.
+        arena: The arena; circles are approximated by polygons.
+        minutes: Duration.
+        seed: Seed of numpy's global generator, which RatInABox uses; its state is restored.
         rate_hz: Positions per second.
 
     Raises:
         ConfigError: If RatInABox is not installed.
-        SourceError: If a number is not above 0.
+        SourceError: If a number is not positive.
     """
     _above_0(arena.name, "length", minutes, "minutes")
     _above_0(arena.name, "rate", rate_hz, "Hz")
     try:
-        from ratinabox.Agent import Agent
-        from ratinabox.Environment import Environment
+        from ratinabox.Agent import Agent  # pyright: ignore[reportMissingImports]
+        from ratinabox.Environment import Environment  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ConfigError(
             f"RatInABox cannot be imported ({error}); pip install neuroslam[rodent], or use roam"
@@ -339,7 +341,7 @@ def ratinabox_walk(arena: Arena, minutes: float, seed: int, rate_hz: float = 20.
     np.random.seed(seed)
     try:
         boundary, *holes = (line[:-1] for line in arena.outlines[: 1 + len(arena.holes)])
-        most = max(map(len, holes), default=0)  # it wants as many corners of every hole
+        most = max(map(len, holes), default=0)  # RatInABox needs equally many corners of each hole
         holes = [np.vstack([h, np.linspace(h[-1], h[0], most - len(h) + 2)[1:-1]]) for h in holes]
         outline = {"boundary": boundary.tolist(), "holes": holes, "walls": arena.walls}
         environment = Environment(outline)
@@ -355,20 +357,20 @@ def ratinabox_walk(arena: Arena, minutes: float, seed: int, rate_hz: float = 20.
 def ornstein_uhlenbeck(
     normals: np.ndarray, times_s: np.ndarray, time_constant_s: float
 ) -> np.ndarray:
-    r"""Turn white noise into noise that is forgotten over a time, of mean 0 and deviation 1.
+    r"""Filter white noise to an Ornstein-Uhlenbeck process of mean 0 and standard deviation 1.
 
     .. math:: x_0 = n_0, \quad x_k = a_k x_{k-1} + \sqrt{1 - a_k^2}\, n_k, \quad
         a_k = e^{-(t_k - t_{k-1}) / \tau}
 
-    It is exact, whatever the intervals are [Uhlenbeck and Ornstein 1930].
+    The recurrence is exact for any intervals [Uhlenbeck and Ornstein 1930].
 
     Args:
         normals: Independent standard normal numbers :math:`n`, ``(..., n)``.
-        times_s: Rising, ``(n,)``.
+        times_s: Rising times in seconds, ``(n,)``.
         time_constant_s: :math:`\tau`.
 
     Returns:
-        Noise of the shape of ``normals``.
+        The process, of the shape of ``normals``.
 
     Example:
         >>> ornstein_uhlenbeck(np.array([1.0, 0.0]), np.array([0.0, 2.0]), 2.0).round(4).tolist()
@@ -376,15 +378,15 @@ def ornstein_uhlenbeck(
     """
     out = np.array(normals, np.float64)
     last, n = 1, len(times_s)
-    passed = np.diff(times_s, prepend=times_s[:1]) / time_constant_s
-    out[..., 1:] *= np.sqrt(-np.expm1(-2.0 * passed[1:]))
+    elapsed = np.diff(times_s, prepend=times_s[:1]) / time_constant_s
+    out[..., 1:] *= np.sqrt(-np.expm1(-2.0 * elapsed[1:]))
     while last < n:
-        # The recurrence as a cumulative sum of growing terms, in stretches that cannot overflow.
-        grown = np.cumsum(passed[last:])
+        # The recurrence as a cumulative sum of growing terms, in sections that cannot overflow.
+        grown = np.cumsum(elapsed[last:])
         size = max(1, int(np.searchsorted(grown, 300.0, side="right")))
         growth = np.exp(np.minimum(grown[:size], 300.0))
-        stretch = out[..., last : last + size]
-        stretch[...] = (out[..., last - 1 : last] + np.cumsum(growth * stretch, axis=-1)) / growth
+        section = out[..., last : last + size]
+        section[...] = (out[..., last - 1 : last] + np.cumsum(growth * section, axis=-1)) / growth
         last += size
     return out
 
@@ -394,8 +396,10 @@ def _spikes(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray | None:
         return None
     spikes = arrays["spikes_s"]
     if spikes.ndim != 1 or spikes.dtype.kind not in "fiu":
-        raise SourceError(f"{path}: spikes_s is {spikes.shape}; expected (m,) in seconds")
-    return spikes[np.isfinite(spikes)].astype(np.float64)
+        raise SourceError(
+            f"{path}: spikes_s has shape {spikes.shape}; expected times (m,) in seconds"
+        )
+    return np.asarray(spikes[np.isfinite(spikes)], np.float64)
 
 
 def _above_0(name: str, what: str, value: float, unit: str) -> None:

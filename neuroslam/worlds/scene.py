@@ -1,4 +1,4 @@
-"""What a rendered world is made of: walls, pillars, figures, surfaces, and the routes in it."""
+"""Elements of a rendered world: walls, pillars, figures, surfaces and routes."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.worlds.atlas import Atlas, halvings
 
 
 class Surface(NamedTuple):
-    """A horizontal picture of the ground or the ceiling, seen as on a map: x to the right, y up.
+    """Texture of the ground or the ceiling, oriented as a map: x to the right, y up.
 
     Attributes:
-        image: ``uint8 (h, w, 3)``; its lower left corner lies at ``(x_m, y_m)``.
+        image: ``uint8 (h, w, 3)``; its lower left corner is at ``(x_m, y_m)``.
         px_per_m: Pixels per metre.
         height_m: Height above the floor; 0 for the ground.
     """
@@ -31,11 +31,11 @@ class Billboard(NamedTuple):
     """An upright cut-out that always faces the camera: a plant, a tree, a person.
 
     Attributes:
-        x_m: Where it stands.
-        y_m: Where it stands.
-        width_m: Width of its picture.
-        height_m: Height of its picture; it stands on the floor.
-        cutout: Which of the world's cut-outs it shows.
+        x_m: Position.
+        y_m: Position.
+        width_m: Width of the cut-out.
+        height_m: Height of the cut-out, which stands on the floor.
+        cutout: Index of the world's cut-out.
     """
 
     x_m: float
@@ -46,11 +46,11 @@ class Billboard(NamedTuple):
 
 
 class Route:
-    """A closed path: a dense table of places, driven at constant speed.
+    """A closed path, a dense table of positions, driven at constant speed.
 
     Args:
-        points_m: Places along the path, shape ``(m, 2)``, the first not repeated at the end.
-        headings_rad: Direction of travel at each of them, shape ``(m,)``.
+        points_m: Positions along the path, shape ``(m, 2)``, the first not repeated at the end.
+        headings_rad: Heading at each position, shape ``(m,)``.
 
     Example:
         >>> lap = ellipse_route(2.0, 1.0)
@@ -62,8 +62,8 @@ class Route:
         closed = np.vstack([points_m, points_m[:1]])
         steps = np.hypot(*np.diff(closed, axis=0).T)
         self._along = np.concatenate([[0.0], np.cumsum(steps)])
-        turning = np.unwrap(np.append(headings_rad, headings_rad[0]))
-        self._table = np.column_stack([closed, turning])
+        headings = np.unwrap(np.append(headings_rad, headings_rad[0]))
+        self._table = np.column_stack([closed, headings])
 
     @property
     def length_m(self) -> float:
@@ -78,25 +78,25 @@ class Route:
         return poses
 
     def poses(self, n: int) -> np.ndarray:
-        """Return ``n`` poses at equal distances around one lap, shape ``(n, 3)``."""
+        """Return ``n`` equidistant poses of one lap, shape ``(n, 3)``."""
         return self.at(np.arange(n) * (self.length_m / n))
 
 
 def ellipse_route(
     semi_x_m: float, semi_y_m: float, centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> Route:
-    """Return an ellipse driven counter-clockwise from its rightmost point."""
+    """Return a counter-clockwise ellipse that starts at its rightmost point."""
     t = np.arange(20_000) * (TWO_PI / 20_000)
     points = np.column_stack([semi_x_m * np.cos(t), semi_y_m * np.sin(t)]) + centre_m
     return Route(points, np.arctan2(semi_y_m * np.cos(t), -semi_x_m * np.sin(t)))
 
 
 def rounded_route(corners_m: list[tuple[float, float]], radius_m: float) -> Route:
-    """Return a closed polygon whose corners are arcs; it starts half-way along its first side.
+    """Return a closed polygon with rounded corners; it starts in the middle of its first side.
 
     Args:
-        corners_m: The polygon, in the order of travel.
-        radius_m: Radius of the arcs; made smaller where two corners are too close for it.
+        corners_m: Corners of the polygon, in the order of travel.
+        radius_m: Radius of the arcs; smaller where a side is too short for it.
     """
     corners = np.asarray(corners_m, dtype=float)
     n = len(corners)
@@ -104,10 +104,11 @@ def rounded_route(corners_m: list[tuple[float, float]], radius_m: float) -> Rout
     lengths = np.hypot(*sides.T)
     headings = np.arctan2(sides[:, 1], sides[:, 0])
     at = (corners[0] + corners[1]) / 2.0
-    points, angles = [], []
+    points: list[np.ndarray] = []
+    angles: list[np.ndarray] = []
     for i in range(n):  # along side i to its end, then around the corner there
         j = (i + 1) % n
-        turn = (headings[j] - headings[i] + math.pi) % TWO_PI - math.pi
+        turn = wrap_angle(headings[j] - headings[i])
         half = abs(math.tan(turn / 2.0))
         room = 0.5 * min(lengths[i], lengths[j])
         cut = min(radius_m * half, room)
@@ -130,37 +131,38 @@ def _add_line(
     points: list[np.ndarray], angles: list[np.ndarray], a: np.ndarray, b: np.ndarray, heading: float
 ) -> None:
     if np.hypot(*(b - a)) > 1e-9:
-        points.append(a[None])  # a straight needs its ends only; its end is the next piece's start
+        points.append(a[None])  # the two ends suffice; the end is the start of the next piece
         points.append((a + (b - a) * (1.0 - 1e-9))[None])
         angles.append(np.full(2, heading))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class World:
-    """Geometry and looks of a place; nothing in it moves.
+    """Geometry and textures of a static world.
 
-    A wall runs from ``(x0, y0)`` to ``(x1, y1)`` and is seen from its right-hand side; solids are
-    walked counter-clockwise, rooms clockwise, so that a picture on it is never mirrored.
+    A wall runs from ``(x0, y0)`` to ``(x1, y1)`` and is visible from its right-hand side: the walls
+    of a solid run counter-clockwise, those of a room clockwise. So no texture is mirrored.
 
     Attributes:
-        name: Its name in the catalogue.
-        description: One line.
-        walls: ``float64 (n, 4)``: x0, y0, x1, y1 in metres.
-        wall_strips: ``int (n,)``: which of ``strips`` each wall shows.
-        wall_offsets_m: ``(n,)``: where on its strip the wall starts.
-        strips: Pictures of walls, ``uint8 (h, w, 3)``, and each one's pixels per metre.
-        pillars: ``(m, 3)``: x, y, radius in metres.
-        pillar_strips: ``int (m,)``: which of ``strips`` goes around each pillar.
-        billboards: Figures that stand still.
-        cutouts: Pictures of figures, ``uint8 (h, w, 4)``, the fourth channel is opacity.
-        people: For each kind of passer-by, the cut-outs of one walking cycle.
-        ground: Picture of the floor.
-        ceiling: Picture of the ceiling, or ``None`` under the open sky.
-        sky: ``uint8 (h, w, 3)`` all around; its lower edge is the horizon. Needed if no ceiling.
-        haze: Colour that distant things fade to.
-        sight_m: Distance at which 63 % of a thing's colour has faded.
-        routes: Closed paths, the first is the default.
-        lanes_m: How far to the left of a route passers-by walk.
+        name: Name in the catalogue.
+        description: Description in one line.
+        walls: x0, y0, x1, y1 in metres, ``float64 (n, 4)``.
+        wall_strips: Index of the strip on each wall, ``int (n,)``.
+        wall_offsets_m: Position on the strip at which the wall starts, ``(n,)``.
+        strips: Textures of walls, ``uint8 (h, w, 3)``, with their pixels per metre.
+        pillars: x, y, radius in metres, ``(m, 3)``.
+        pillar_strips: Index of the strip around each pillar, ``int (m,)``.
+        billboards: Static figures.
+        cutouts: Textures of figures, ``uint8 (h, w, 4)``; the fourth channel is opacity.
+        people: Cut-outs of the walking cycle of each kind of pedestrian.
+        ground: Texture of the floor.
+        ceiling: Texture of the ceiling; ``None`` under the open sky.
+        sky: Panorama, ``uint8 (h, w, 3)``, whose lower edge is the horizon; required without a
+            ceiling.
+        haze: Colour to which distant surfaces fade.
+        sight_m: Distance at which 63 % of a surface's colour has faded.
+        routes: Closed paths; the first is the default.
+        lanes_m: Offsets to the left of the route at which pedestrians walk.
         sense: Default camera and motion, see :class:`Sense`.
     """
 
@@ -186,12 +188,12 @@ class World:
 
     @cached_property
     def atlas(self) -> Atlas:
-        """All surfaces in one picture, at several resolutions; made once."""
+        """All surfaces in one image at several resolutions."""
         return Atlas(self.strips, self.ground.image, self.ceiling and self.ceiling.image, self.sky)
 
     @cached_property
     def figure_levels(self) -> list[list[np.ndarray]]:
-        """Each cut-out at halving resolutions, colours times opacity."""
+        """Each cut-out at halving resolutions, with colours premultiplied by opacity."""
         return [halvings(image) for image in self.cutouts]
 
     @cached_property
@@ -202,22 +204,22 @@ class World:
     @property
     def wall_heights_m(self) -> np.ndarray:
         """Height of each wall in metres, shape ``(n,)``."""
-        return self.strip_heights_m[self.wall_strips]
+        return np.asarray(self.strip_heights_m[self.wall_strips])
 
     @property
     def segments(self) -> np.ndarray:
-        """The walls as line segments ``(n, 2, 2)``, as matplotlib's ``LineCollection`` takes."""
+        """The walls as line segments, ``(n, 2, 2)``, for matplotlib's ``LineCollection``."""
         return self.walls.reshape(-1, 2, 2)
 
 
 class Sense(NamedTuple):
-    """How a world is seen and driven unless the user says otherwise.
+    """Default camera and motion in a world.
 
     Attributes:
-        frames_per_lap: Frames in one lap of the first route; other routes keep the speed.
-        laps: Laps.
-        panoramic: Whether the camera sees all around.
-        horizon: Where the horizon is in the picture, from its top, as a share of the height.
+        frames_per_lap: Frames in one lap of the first route; other routes have the same speed.
+        laps: Number of laps.
+        panoramic: Whether the camera is panoramic.
+        horizon: Row of the horizon as a fraction of the height, from the top.
         camera_height_m: Height of the camera.
         odometry: Whether the robot has wheel odometry.
     """

@@ -1,4 +1,4 @@
-"""Rendered worlds as sources: ``world:corridor?laps=2&people=1`` is a camera driven through one."""
+"""Rendered worlds as sources: ``world:corridor?laps=2&people=1`` is a drive through a world."""
 
 import math
 from typing import ClassVar, NamedTuple, Self
@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from neuroslam.errors import SourceError
-from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.geometry import TWO_PI, compose, wrap_angles
 from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame, Pose, Velocity
@@ -31,21 +31,21 @@ __all__ = [
 
 _PERSON_M = (0.8, 1.8)
 _STEP_M = 0.35
-_COMPASS_S = 30.0  # within which the slow half of a compass's error changes
+_COMPASS_S = 30.0  # time constant of the slow half of the compass error
 
 
 class OdometryNoise(NamedTuple):
-    r"""What wheel odometry adds to the true motion.
+    r"""Noise of wheel odometry.
 
     :math:`\hat v = v (1 + a + b\,n)`, :math:`\hat\omega = \omega (1 + c) + d\,n' + e` with
     independent standard normal :math:`n, n'` for every frame.
 
     Attributes:
-        speed_scale: :math:`a`, share of the speed that is always added.
-        speed_noise: :math:`b`, standard deviation as a share of the speed, each frame anew.
-        turn_scale: :math:`c`, share of the turn rate that is always added.
-        turn_noise_rad_s: :math:`d`, standard deviation in rad/s, each frame anew.
-        turn_bias_rad_s: :math:`e`, turn rate in rad/s that is always added.
+        speed_scale: :math:`a`, constant error as a fraction of the speed.
+        speed_noise: :math:`b`, standard deviation per frame as a fraction of the speed.
+        turn_scale: :math:`c`, constant error as a fraction of the turn rate.
+        turn_noise_rad_s: :math:`d`, standard deviation per frame in rad/s.
+        turn_bias_rad_s: :math:`e`, constant error of the turn rate in rad/s.
     """
 
     speed_scale: float = 0.0
@@ -56,7 +56,7 @@ class OdometryNoise(NamedTuple):
 
     @classmethod
     def of_level(cls, level: float) -> Self:
-        """Return noise in usual proportions; 0.05 makes a lap miss its start by metres.
+        """Return noise with typical proportions; at 0.05 a lap ends metres from its start.
 
         Example:
             >>> OdometryNoise.of_level(0.1).turn_scale
@@ -65,10 +65,10 @@ class OdometryNoise(NamedTuple):
         return cls(level, level, level, level, 0.1 * level)
 
     def apply(self, velocity: np.ndarray, seed: int) -> np.ndarray:
-        """Return measured from true velocities, both ``(n, 2)``: m/s, rad/s.
+        """Add the noise to true velocities, ``(n, 2)``: m/s, rad/s.
 
-        The robot stands still at the first frame, so that its row stays as it is. A row does not
-        depend on how many follow it.
+        The first row is unchanged, as the robot stands still at the first frame. A row does not
+        depend on the rows after it.
         """
         n = np.random.default_rng([seed, 1]).standard_normal(velocity.shape)
         v = velocity[:, 0] * (1.0 + self.speed_scale + self.speed_noise * n[:, 0])
@@ -80,65 +80,107 @@ class OdometryNoise(NamedTuple):
 
 
 class WorldOptions(BaseModel):
-    """What may follow the ``?`` of a world's name."""
+    """Options after the ``?`` of a world's name."""
 
     renamed: ClassVar[dict[str, str]] = {"carried": "kidnapped"}
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    laps: float | None = Field(None, gt=0, le=10_000, description="laps; none: as the world's")
-    start: float = Field(0.0, ge=0, lt=1, description="share of a lap at which the drive starts")
-    route: int = Field(1, ge=1, description="which of the world's routes")
+    laps: float | None = Field(
+        default=None, gt=0, le=10_000, description="laps; none: the world's default"
+    )
+    start: float = Field(default=0.0, ge=0, lt=1, description="start as a fraction of a lap")
+    route: int = Field(default=1, ge=1, description="number of the world's route")
     frames_per_lap: int | None = Field(
-        None, ge=8, le=1_000_000, description="frames in one lap; sets the speed"
+        default=None, ge=8, le=1_000_000, description="frames in one lap; sets the speed"
     )
-    rate: float = Field(10.0, gt=0, description="frames per second")
-    width: int | None = Field(None, ge=8, le=4096, description="columns; none: 160, panoramic 256")
-    height: int | None = Field(None, ge=4, le=4096, description="rows; none: 80, panoramic 64")
-    fov: float = Field(90.0, ge=10, le=150, description="horizontal view in degrees")
-    panoramic: bool | None = Field(None, description="see all around; none: as the world's")
-    grey: bool = Field(False, description="one channel instead of RGB")
-    look: int = Field(0, ge=0, description="seed of what is painted on the walls")
-    seed: int = Field(0, ge=0, description="seed of odometry noise, light and passers-by")
-    noise: float = Field(0.0, ge=0, le=1, description="level of odometry noise, all terms at once")
-    speed_scale: float | None = Field(None, gt=-1, description="one term of it: share of speed")
-    speed_noise: float | None = Field(None, ge=0, description="one term of it: share of speed")
-    turn_scale: float | None = Field(None, gt=-1, description="one term of it: share of turn rate")
-    turn_noise: float | None = Field(None, ge=0, description="one term of it, in rad/s")
-    turn_bias: float | None = Field(None, description="one term of it, in rad/s")
-    odometry: bool | None = Field(None, description="deliver odometry; none: as the world's")
-    light: float = Field(0.0, ge=0, lt=1, description="share by which brightness drifts")
-    gain: float = Field(1.0, gt=0, le=10, description="factor on the brightness of all frames")
-    people: int = Field(0, ge=0, le=50, description="passers-by")
-    ranges: int = Field(0, ge=0, le=3600, description="beams of a range scanner all around")
-    range_noise_m: float = Field(0.01, ge=0, description="error of each beam")
+    rate: float = Field(default=10.0, gt=0, description="frames per second")
+    width: int | None = Field(
+        default=None, ge=8, le=4096, description="columns; none: 160, panoramic 256"
+    )
+    height: int | None = Field(
+        default=None, ge=4, le=4096, description="rows; none: 80, panoramic 64"
+    )
+    fov: float = Field(
+        default=90.0, ge=10, le=150, description="horizontal field of view in degrees"
+    )
+    panoramic: bool | None = Field(
+        default=None, description="panoramic camera; none: the world's default"
+    )
+    grey: bool = Field(default=False, description="one channel instead of RGB")
+    look: int = Field(default=0, ge=0, description="seed of the textures")
+    seed: int = Field(default=0, ge=0, description="seed of odometry noise, light and pedestrians")
+    noise: float = Field(
+        default=0.0, ge=0, le=1, description="level of odometry noise, for all terms"
+    )
+    speed_scale: float | None = Field(
+        default=None, gt=-1, description="one term of it: fraction of the speed"
+    )
+    speed_noise: float | None = Field(
+        default=None, ge=0, description="one term of it: fraction of the speed"
+    )
+    turn_scale: float | None = Field(
+        default=None, gt=-1, description="one term of it: fraction of the turn rate"
+    )
+    turn_noise: float | None = Field(default=None, ge=0, description="one term of it, in rad/s")
+    turn_bias: float | None = Field(default=None, description="one term of it, in rad/s")
+    odometry: bool | None = Field(
+        default=None, description="deliver odometry; none: the world's default"
+    )
+    light: float = Field(default=0.0, ge=0, lt=1, description="fraction by which brightness drifts")
+    gain: float = Field(
+        default=1.0, gt=0, le=10, description="factor on the brightness of all frames"
+    )
+    people: int = Field(default=0, ge=0, le=50, description="number of pedestrians")
+    ranges: int = Field(
+        default=0, ge=0, le=3600, description="beams of a laser scanner over the full turn"
+    )
+    range_noise_m: float = Field(
+        default=0.01, ge=0, description="standard deviation of each beam in m"
+    )
     compass_deg: float | None = Field(
-        None, ge=0, le=90, description="deliver a compass; its error, half white, half slow"
+        default=None,
+        ge=0,
+        le=90,
+        description="deliver a compass; its error in degrees, half white, half slow",
     )
-    markers: int = Field(0, ge=0, le=50, description="posts with ArUco markers 4X4_50 on the way")
+    markers: int = Field(
+        default=0, ge=0, le=50, description="posts with ArUco markers 4X4_50 along the route"
+    )
     landmark_reach: float = Field(
-        0.0, ge=0, description="deliver the posts in sight as landmarks up to here, m; 0: not"
+        default=0.0,
+        ge=0,
+        description="deliver visible posts up to this distance in m as landmarks; 0: none",
     )
     landmark_noise: float = Field(
-        0.03, ge=0, description="their error: as a share of the distance, and in radians"
+        default=0.03, ge=0, description="their error: fraction of the distance, and radians"
     )
     outliers: float = Field(
-        0.0, ge=0, le=1, description="share of landmarks that are said to be where they are not"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="fraction of landmarks at a wrong position",
     )
-    labels: bool = Field(True, description="landmarks have names; else they are to be told apart")
+    labels: bool = Field(
+        default=True, description="landmarks have numbers; else they are anonymous"
+    )
     dark: str = Field(
-        "", pattern=r"^(\d+-\d+)?$", description="the camera is covered, seconds, as 60-120"
+        default="",
+        pattern=r"^(\d+-\d+)?$",
+        description="interval in s in which the camera is covered, as 60-120",
     )
     blind: str = Field(
-        "", pattern=r"^(\d+-\d+)?$", description="the scanner measures nothing, seconds, as 60-120"
+        default="",
+        pattern=r"^(\d+-\d+)?$",
+        description="interval in s in which the scanner measures nothing, as 60-120",
     )
     kidnapped: str = Field(
-        "",
+        default="",
         pattern=r"^(\d+:0?\.\d+)?$",
-        description="the robot is kidnapped, as 60:0.5: at 60 s on by half a lap",
+        description="kidnap the robot, as 60:0.5: at 60 s by half a lap",
     )
 
     def odometry_noise(self) -> OdometryNoise:
-        """Return the noise that ``noise`` and the single terms ask for together."""
+        """Return the noise of level ``noise``, with the single terms that are set."""
         level = OdometryNoise.of_level(self.noise)
         terms = (
             self.speed_scale,
@@ -153,21 +195,22 @@ class WorldOptions(BaseModel):
 
 
 class WorldSource(IndexedSource):
-    """A camera on wheels that drives a route of a rendered world.
+    """Frames of a robot with a camera on a route of a rendered world.
 
-    A lap takes a whole number of frames, so every lap visits exactly the same poses, whatever the
-    start; ``n`` laps have one frame more than ``n`` times that, and the last closes the loop.
+    A lap has an integer number of frames, so every lap visits exactly the same poses, wherever it
+    starts. ``n`` laps have ``n`` times as many frames and one more, which closes the loop.
 
     Args:
         name: A name of the :func:`catalogue`.
-        options: How to drive and see it.
+        options: Options of drive and sensors.
 
     Attributes:
-        world: Its geometry and looks.
+        world: Geometry and textures.
         camera: The camera.
-        route: The path that is driven.
+        route: The route.
         frames_per_lap: Frames in one lap.
-        noise: The odometry's noise.
+        noise: Noise of the odometry.
+        posts_m: Positions of the posts with markers, ``(n, 2)``.
 
     Raises:
         SourceError: If there is no such world or route.
@@ -193,12 +236,12 @@ class WorldSource(IndexedSource):
         self.frame_rate_hz = options.rate
         laps = options.laps or world.sense.laps
         self.n_frames = round(laps * self.frames_per_lap) + 1
-        wide = world.sense.panoramic if options.panoramic is None else options.panoramic
+        panoramic = world.sense.panoramic if options.panoramic is None else options.panoramic
         self.camera = Camera(
-            width=options.width or (256 if wide else 160),
-            height=options.height or (64 if wide else 80),
+            width=options.width or (256 if panoramic else 160),
+            height=options.height or (64 if panoramic else 80),
             fov_deg=options.fov,
-            panoramic=wide,
+            panoramic=panoramic,
             camera_height_m=world.sense.camera_height_m,
             horizon=world.sense.horizon,
         )
@@ -216,19 +259,19 @@ class WorldSource(IndexedSource):
             along[at:] += round(float(share) * self.frames_per_lap)
             self._truths = lap[along % self.frames_per_lap]
             drive = np.diff(self._truths, axis=0, prepend=self._truths[:1])
-            drive[at : at + 1] = moved[at : at + 1]  # wheels do not feel a kidnapping
+            drive[at : at + 1] = moved[at : at + 1]  # odometry does not measure the kidnapping
             moved = drive
-        self.places_m = np.empty((0, 2))
+        self.posts_m = np.empty((0, 2))
         if options.markers:
-            self.world, self.places_m = with_markers(
+            self.world, self.posts_m = with_markers(
                 world, options.markers, world.sense.camera_height_m
             )
         self._headings = None
         if options.compass_deg is not None:
-            draw = np.random.default_rng([options.seed, 5]).standard_normal((2, self.n_frames))
+            normals = np.random.default_rng([options.seed, 5]).standard_normal((2, self.n_frames))
             times = np.arange(self.n_frames) / options.rate
-            slow = ornstein_uhlenbeck(draw[:1], times, _COMPASS_S)[0]
-            error = math.radians(options.compass_deg) * math.sqrt(0.5) * (draw[1] + slow)
+            slow = ornstein_uhlenbeck(normals[:1], times, _COMPASS_S)[0]
+            error = math.radians(options.compass_deg) * math.sqrt(0.5) * (normals[1] + slow)
             self._headings = wrap_angles(self._truths[:, 2] + error)
         self._dark, self._blind = _span(options.dark), _span(options.blind)
         true = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), wrap_angles(moved[:, 2])])
@@ -250,33 +293,33 @@ class WorldSource(IndexedSource):
         return self._velocities.copy()
 
     def gain(self, time_s: float) -> float:
-        """Return the brightness at this time: two slow waves, together within ``light``."""
+        """Return the brightness at this time: a sum of two slow waves within ``light``."""
         slow = math.sin(TWO_PI * time_s / 47.0 + self._phases[0])
         slower = math.sin(TWO_PI * time_s / 113.0 + self._phases[1])
         return self.options.gain * (1.0 + self.options.light * (0.4 * slow + 0.6 * slower))
 
     def figures(self, time_s: float) -> list[Billboard]:
-        """Return the passers-by at this time; every other one comes towards the robot."""
+        """Return the pedestrians at this time; every second one walks towards the robot."""
         present = []
-        for i, (place, haste) in enumerate(self._people.tolist()):
-            speed = (0.6 + 0.7 * haste) * (1.0 if i % 2 else -1.0)
-            along = place * self.route.length_m + speed * time_s
-            x, y, theta = self.route.at(along)[0].tolist()
+        for i, (start, pace) in enumerate(self._people.tolist()):
+            speed = (0.6 + 0.7 * pace) * (1.0 if i % 2 else -1.0)
+            along = start * self.route.length_m + speed * time_s
             lane = self.world.lanes_m[i % len(self.world.lanes_m)]
+            at = compose(Pose(*self.route.at(along)[0].tolist()), Pose(0.0, lane, 0.0))
             cycle = self.world.people[i % len(self.world.people)]
-            x, y = x - lane * math.sin(theta), y + lane * math.cos(theta)
-            present.append(Billboard(x, y, *_PERSON_M, cycle[int(along // _STEP_M) % len(cycle)]))
+            cutout = cycle[int(along // _STEP_M) % len(cycle)]
+            present.append(Billboard(at.x_m, at.y_m, *_PERSON_M, cutout))
         return present
 
     def frame(self, index: int) -> Frame:
-        """Return the frame of that number; it does not depend on which were asked for before.
+        """Return the frame of that index; it does not depend on earlier calls.
 
         Raises:
             SourceError: If there is no such frame.
         """
         if not 0 <= index < self.n_frames:
             raise SourceError(f"{self.name}: no frame {index}; expected 0 to {self.n_frames - 1}")
-        time_s = index / self.frame_rate_hz
+        time_s = index / self.options.rate
         pose = self.truth(index)
         image = render(self.world, pose, self.camera, self.figures(time_s), self.gain(time_s))
         if self.options.grey:
@@ -299,29 +342,29 @@ class WorldSource(IndexedSource):
         )
 
     def _landmarks(self, index: int, pose: Pose) -> np.ndarray:
-        """Number, distance and bearing of the posts in sight, ``(n, 3)``."""
+        """Return number, distance and bearing of the visible posts, ``(n, 3)``, with noise."""
         options, camera = self.options, self.camera
-        seen = in_sight(self.world, pose, self.places_m, camera.camera_height_m)
+        seen = in_sight(self.world, pose, self.posts_m, camera.camera_height_m)
         distance, bearing = seen.T
-        wide = math.pi if camera.panoramic else math.radians(camera.fov_deg) / 2.0
-        there = (distance <= options.landmark_reach) & (np.abs(bearing) < wide)
-        # Drawn for all: what one landmark adds does not depend on which others are in sight.
-        draw = np.random.default_rng([options.seed, 4, index])
-        noise = options.landmark_noise * draw.standard_normal((2, len(seen)))
-        wrong = draw.uniform(size=len(seen)) < options.outliers
-        elsewhere = draw.uniform(
-            [[0.3], [-wide]], [[options.landmark_reach], [wide]], (2, len(seen))
+        half_view = math.pi if camera.panoramic else math.radians(camera.fov_deg) / 2.0
+        visible = (distance <= options.landmark_reach) & (np.abs(bearing) < half_view)
+        # Drawn for all posts, so that the noise of one does not depend on which are visible.
+        rng = np.random.default_rng([options.seed, 4, index])
+        noise = options.landmark_noise * rng.standard_normal((2, len(seen)))
+        wrong = rng.uniform(size=len(seen)) < options.outliers
+        elsewhere = rng.uniform(
+            [[0.3], [-half_view]], [[options.landmark_reach], [half_view]], (2, len(seen))
         )
         distance = np.where(wrong, elsewhere[0], distance * (1.0 + noise[0]))
         bearing = np.where(wrong, elsewhere[1], bearing + noise[1])
         number = np.arange(len(seen)) if options.labels else np.full(len(seen), -1)
-        return np.column_stack([number, np.maximum(distance, 0.0), bearing])[there]
+        return np.asarray(np.column_stack([number, np.maximum(distance, 0.0), bearing])[visible])
 
     def _measure(self, index: int, pose: Pose) -> np.ndarray:
         options = self.options
         ranges = measure_ranges(self.world, pose, options.ranges, self.camera.camera_height_m)
         noise = np.random.default_rng([options.seed, 3, index]).standard_normal(len(ranges))
-        return np.maximum(ranges + options.range_noise_m * noise, 0.0)
+        return np.asarray(np.maximum(ranges + options.range_noise_m * noise, 0.0))
 
 
 def _span(text: str) -> tuple[float, float] | None:
@@ -341,7 +384,7 @@ def open_world(spec: str) -> WorldSource:
     The names are in :func:`catalogue`, the options in :class:`WorldOptions`.
 
     Raises:
-        SourceError: If the name or an option is unknown, or a value cannot be used.
+        SourceError: If the name or an option is unknown, or a value is invalid.
 
     Example:
         >>> open_world("world:town?route=5&laps=1&people=2").options.people
@@ -349,5 +392,5 @@ def open_world(spec: str) -> WorldSource:
     """
     name, _, query = spec.removeprefix("world:").partition("?")
     if name not in catalogue():
-        build_world(name)  # says which there are
+        build_world(name)  # raises an error that lists the names
     return WorldSource(name, parse_options(f"world {name!r}", query, WorldOptions))

@@ -4,6 +4,7 @@ import json
 import pickle
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from neuroslam.brain.checkpoint import FORMAT_VERSION
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.sensors import open_source
-from neuroslam.state.files import tensors_digest
+from neuroslam.state.files import save_checked, tensors_digest
 from neuroslam.types import Frame
 
 WORLD = "world:corridor?laps=2&noise=0.05"
@@ -73,6 +74,21 @@ def test_going_on_in_a_new_process_is_bit_equal_to_never_having_stopped(stop, tm
     command = [sys.executable, "-c", program, tmp_path / "cut.safetensors", tmp_path / "on"]
     subprocess.run(command, check=True)
     assert (tmp_path / "on").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+
+
+def test_a_file_with_old_names_in_its_config_loads_without_a_warning(brain, tmp_path):
+    written = brain.config.model_dump(mode="json")
+    for old, new in (("carried", "kidnapped"), ("carried_factor", "kidnapped_factor")):
+        written["sessions"][old] = written["sessions"].pop(new)
+    written["sessions"]["carried"] = "ignore"
+    path = tmp_path / "old.safetensors"
+    save_checked(path, {"format": FORMAT_VERSION, "config": written}, brain.state_dict())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        copy = load_brain(path)
+    assert told == []
+    sessions = brain.config.sessions.model_copy(update={"kidnapped": "ignore"})
+    assert copy.config == brain.config.model_copy(update={"sessions": sessions})
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -87,7 +87,7 @@ def test_landmarks_bring_a_lap_home(cells, drive):
     track = np.array([brain(frame).pose[:2] for frame in drive])
     assert absolute_trajectory_error(track, truth, "rigid").rmse < 0.35
     assert brain.semantic.n == 12
-    places = open_source(DRIVE).places_m
+    places = open_source(DRIVE).posts_m
     known = brain.semantic.landmarks()
     laid = align(track, truth, "rigid").apply(known["place_m"])
     off = np.linalg.norm(laid - places[known["number"]], axis=1)
@@ -130,7 +130,7 @@ def test_a_landmark_that_was_first_seen_where_it_is_not_is_found_where_it_is(fol
     np.testing.assert_allclose(cells.landmarks()["place_m"], [[2.0, 0.0]], atol=0.05)
 
 
-def test_landmarks_without_names_are_told_apart_by_their_places():
+def test_landmarks_without_names_are_distinguished_by_position():
     cells = SemanticCells(SemanticConfig())
     ring = [(-1, 3.0, 2.0 * math.pi * k / 5) for k in range(5)]
     for _ in range(60):
@@ -143,7 +143,7 @@ def test_landmarks_without_names_are_told_apart_by_their_places():
     assert set(known["name"]) == {f"nameless_{k}" for k in range(5)}
 
 
-def test_a_landmark_that_two_sensors_tell_counts_once():
+def test_a_landmark_that_two_sensors_report_counts_once():
     scanner, camera = (
         np.array([[7, 2.0, 0.1], [-1, 1.0, 0.0]]),
         np.array([[7, 2.2, 0.1], [8, 3, 0]]),
@@ -169,7 +169,7 @@ def test_what_was_seen_once_is_no_landmark():
     assert cells.n == len(ring)
 
 
-def test_who_was_carried_is_told_by_known_landmarks_where_it_is():
+def test_a_kidnapped_robot_relocalises_by_known_landmarks():
     cells, _ = taught()
     there = np.array([1.5, -1.0])
     places = {k: 2.0 * np.array([math.cos(a), math.sin(a)]) for k, a in
@@ -225,7 +225,7 @@ def test_views_can_be_landmarks(drive):
         (np.array([[1.0, -1.0, 0.0]]), "negative or not a number"),
     ],
 )
-def test_what_no_landmark_can_be_is_refused_and_changes_nothing(rows, said, drive):
+def test_an_invalid_landmark_is_refused_and_changes_nothing(rows, said, drive):
     brain = lives(brain_of(), drive[:10])
     before = {name: value.clone() for name, value in brain.state_dict().items()}
     with pytest.raises(BadFrame, match=f"frame 10: .*{said}"):
@@ -270,17 +270,17 @@ WRONG = {
     "three speeds": ({"velocity": (1.0, 0.0, 0.0)}, "odometry is of type tuple; expected speed"),
     "text speed": ({"velocity": ("1", "0")}, "odometry is of type tuple; expected speed (m/s)"),
     "no turn rate": ({"velocity": Velocity(1.0, None)}, "odometry is of type Velocity; expected"),
-    "float image": ({"image": np.ones((40, 64))}, "picture is float64 (40, 64); expected uint8"),
+    "float image": ({"image": np.ones((40, 64))}, "image is float64 (40, 64); expected uint8"),
     "image with alpha": (
         {"image": np.ones((40, 64, 4), np.uint8)},
-        "picture is uint8 (40, 64, 4); expected uint8, (h, w) or (h, w, 3)",
+        "image is uint8 (40, 64, 4); expected uint8, (h, w) or (h, w, 3)",
     ),
-    "no pixels": ({"image": np.ones((0, 64), np.uint8)}, "picture is uint8 (0, 64); expected"),
-    "list as image": ({"image": [[0, 1]]}, "picture is of type list, no array of numpy; expected"),
-    "file as image": ({"image": "a.png"}, "picture is 'a.png', no array of numpy; expected uint8"),
+    "no pixels": ({"image": np.ones((0, 64), np.uint8)}, "image is uint8 (0, 64); expected"),
+    "list as image": ({"image": [[0, 1]]}, "image is of type list, not a numpy array; expected"),
+    "file as image": ({"image": "a.png"}, "image is 'a.png', not a numpy array; expected uint8"),
     "tensor as image": (
         {"image": torch.zeros(40, 64, dtype=torch.uint8)},
-        "picture is an array of torch.uint8 of shape (40, 64), no array of numpy; expected",
+        "image is an array of torch.uint8 of shape (40, 64), not a numpy array; expected",
     ),
     "time of text": ({"time_s": "noon"}, "its time is 'noon'; expected a number, in s"),
     "no time": ({"time_s": None}, "its time is None; expected a number, in s"),
@@ -339,7 +339,7 @@ def test_no_walls_and_no_landmarks_may_be_empty_lists(drive):
     assert equal_states(*brains) == []
 
 
-def test_who_leaves_the_space_is_told_what_to_raise():
+def test_leaving_the_space_names_the_parameter_to_raise():
     brain = brain_of("semantic", semantic={"space": {"reach_m": 2.0}})
     with pytest.raises(MapError, match=r"outside of its space of \+-2 m; raise semantic.space"):
         lives(brain, [Frame(i, 0.1 * i, velocity=Velocity(1.0, 0.0)) for i in range(100)])
@@ -369,7 +369,7 @@ def test_a_merge_of_two_sessions_is_the_union_of_all_that_they_know(cells, sessi
     n = report.counts["experiences"]
     assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     if "place" in cells:
-        n = report.counts["place cells"]
+        n = report.counts["place_cells"]
         assert max(n["loaded"], n["partial"]) <= n["merged"] <= n["loaded"] + n["partial"]
     one, other = loaded.semantic.landmarks(), merged.semantic.landmarks()
     order = np.argsort(one["number"]), np.argsort(other["number"])

@@ -23,14 +23,9 @@ import torch
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.evaluation.trajectory import Track, write_tum
-from neuroslam.merging.match import find_match
-from neuroslam.runs.files import (
-    RowWriter,
-    experiences_csv,
-    links_csv,
-    read_trace,
-    trajectory,
-)
+from neuroslam.merging import find_match
+from neuroslam.runs.files import RowWriter, experiences_csv, links_csv
+from neuroslam.runs.reading import read_trace, trajectory
 from neuroslam.sensors import open_source
 from neuroslam.sensors.scan import walls_in_scan
 

@@ -121,7 +121,7 @@ def test_without_moving_and_turning_the_pose_cells_known_places_are_made_anew(
     assert brain.map.n_links > single[1][2]
 
 
-def test_who_asks_for_less_confirmation_joins_earlier(tour, first):
+def test_a_lower_confirm_joins_earlier(tour, first):
     at = []
     for confirm in (1, 2, 4, 8):
         brain = lived(tour[320:450], BrainConfig(sessions={"confirm": confirm}), [first])
@@ -136,7 +136,7 @@ def test_a_session_that_starts_inside_the_stored_map_localises_and_adds_nothing(
     brain = lived(tour[100:290], stored=[first])
     (report,) = brain.sessions.merges
     assert report["at_frame"] < 120
-    assert report["reason"] == "nothing is new: the place was known"
+    assert report["reason"] == "no experience is new"
     assert sizes(brain) == sizes(first)
     for name in ("cell", "template", "first_frame", "session", "number"):
         assert torch.equal(brain.map.experiences[name], first.map.experiences[name])
@@ -165,7 +165,7 @@ def halves(tour):
     return lived(tour[:120]), lived(tour[160:300])
 
 
-def test_both_of_two_stored_maps_are_joined_when_their_turn_comes(tour, halves, single):
+def test_both_of_two_stored_maps_are_joined_once_recognised(tour, halves, single):
     brain = lived(tour[320:900], stored=halves)
     assert len(brain.stored) == 0
     assert [len(r["loaded_sessions"]) for r in brain.sessions.merges] == [1, 1]
@@ -195,13 +195,13 @@ def test_one_search_serves_all_stored_maps(tour, halves, monkeypatch):
         assert all(memory.n == halves[0].view.n + halves[1].view.n for memory in stored)
 
 
-def test_what_was_not_joined_says_why(tour, first):
+def test_a_map_that_is_not_joined_has_a_reason(tour, first):
     brain = lived(tour[320:395], stored=[first])
     (said,) = brain.not_joined()
     assert said["sessions"] == [s.name for s in first.sessions.sessions]
     assert said["experiences"] == first.map.n
     assert said["places_that_agree"] < 4
-    assert "4 must" in said["reason"]
+    assert "expected 4" in said["reason"]
     for frame in tour[395:420]:
         brain(frame)
     assert brain.not_joined() == []
@@ -227,7 +227,7 @@ def corridor():
     return frames_of("world:corridor?laps=2")
 
 
-def test_a_carried_robot_keeps_its_map_and_finds_itself_in_it_again(corridor):
+def test_a_kidnapped_robot_keeps_its_map_and_relocalises_in_it(corridor):
     order = [*range(250), *range(100, 300)]
     brain, known = NavigationBrain(), None
     when = []
@@ -241,7 +241,7 @@ def test_a_carried_robot_keeps_its_map_and_finds_itself_in_it_again(corridor):
     assert when[0][0] == 250
     assert when[1][0] < 280
     (report,) = brain.sessions.merges
-    assert report["reason"] == "nothing is new: the place was known"
+    assert report["reason"] == "no experience is new"
     assert [s.began for s in brain.sessions.sessions] == ["start", "kidnapped"]
     # Frames 250 to 299 are new ground: then it is the map of one who was never carried.
     uncarried = lived(corridor[:300])
@@ -250,7 +250,7 @@ def test_a_carried_robot_keeps_its_map_and_finds_itself_in_it_again(corridor):
     assert ((made < 250) | (made >= 400 - 1)).all()
 
 
-def test_a_robot_carried_to_unknown_ground_joins_its_maps_when_the_loop_comes_round(corridor):
+def test_a_robot_kidnapped_to_unmapped_ground_joins_its_maps_at_the_loop_closure(corridor):
     order = [*range(150), *range(300, 681)]  # a lap is 340 frames: 300 to 340 is unknown
     brain = lived(in_order(corridor, order)[:190])
     assert len(brain.stored) == 1
@@ -263,7 +263,7 @@ def test_a_robot_carried_to_unknown_ground_joins_its_maps_when_the_loop_comes_ro
     assert report["counts"]["experiences"]["merged"] > report["counts"]["experiences"]["loaded"]
 
 
-def test_a_robot_that_is_told_to_ignore_it_goes_on_in_one_map(corridor):
+def test_with_kidnapped_ignore_the_map_is_continued(corridor):
     config = BrainConfig(sessions={"kidnapped": "ignore"})
     brain = lived(in_order(corridor, [*range(250), *range(100, 150)]), config)
     assert len(brain.stored) == 0
@@ -339,7 +339,7 @@ def test_a_session_saved_before_at_and_after_its_merge_goes_on_bit_for_bit(tour,
 
 
 @pytest.mark.parametrize("at", [249, 250, 251, 256, 262])
-def test_a_carried_robot_saved_at_any_moment_goes_on_bit_for_bit(at, corridor, tmp_path):
+def test_a_kidnapped_robot_saved_at_any_moment_goes_on_bit_for_bit(at, corridor, tmp_path):
     frames = in_order(corridor, [*range(250), *range(100, 180)])
     uncut = NavigationBrain()
     for k, frame in enumerate(frames):
@@ -388,12 +388,12 @@ def test_different_worlds_are_never_joined(other, corridor_lives):
     for one, two in product(ones, others):
         for found in (find_match(one, two), find_match(two, one)):
             assert found.match is None
-            assert "look" in found.reason
+            assert "match" in found.reason
     for stored, drive in ((ones[0], other_frames[:400]), (others[0], frames[:400])):
         brain = lived(drive, stored=[stored])
         assert brain.sessions.merges == []
         (said,) = brain.not_joined()
-        assert "4 must" in said["reason"]
+        assert "expected 4" in said["reason"]
 
 
 def test_different_real_places_are_never_joined(shared):
@@ -409,7 +409,7 @@ def test_different_real_places_are_never_joined(shared):
     for one, two in product(ones, others):
         found = find_match(one, two)
         assert found.match is None
-        assert "look" in found.reason
+        assert "match" in found.reason
     for stored, drive in ((ones[1], other_frames[:400]), (others[1], frames[:400])):
         assert lived(drive, config, [stored]).sessions.merges == []
 

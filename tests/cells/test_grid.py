@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuroslam.cells import grid
 from neuroslam.cells.grid import LAHNGridCells, LAHNWeights, lahn_drive, lahn_learn
 from neuroslam.cells.oscillators import (
     VelocityOscillators,
@@ -261,13 +262,31 @@ def test_cells_are_silent_at_the_share_of_places_that_the_config_says(grown):
     assert np.abs(fires - (1.0 - CONFIG.silent_fraction)).max() < 0.1
 
 
+def grown_anew(config):
+    """Cells that develop now, though others of this config did before."""
+    grid._developed.clear()
+    return LAHNGridCells(config)
+
+
 def test_the_same_seed_grows_the_same_network_and_another_one_another():
     configs = [GridCellConfig(development_steps=50, seed=seed) for seed in (0, 0, 1)]
-    first, again, other = (LAHNGridCells(config) for config in configs)
+    first, again, other = (grown_anew(config) for config in configs)
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in first.state_dict().items())
     assert not torch.equal(first.feedforward, other.feedforward)
     torch.manual_seed(17)  # the generator of the process has no say
-    assert torch.equal(LAHNGridCells(configs[0]).feedforward, first.feedforward)
+    assert torch.equal(grown_anew(configs[0]).feedforward, first.feedforward)
+
+
+def test_who_develops_as_another_did_is_its_equal_and_apart_from_it():
+    config = GridCellConfig(development_steps=50)
+    first = grown_anew(config)
+    before = {name: value.clone() for name, value in first.state_dict().items()}
+    second = LAHNGridCells(config)
+    second.develop(5)
+    assert not torch.equal(second.feedforward, before["feedforward"])
+    for cells in (first, LAHNGridCells(config)):
+        assert all(torch.equal(v, before[name]) for name, v in cells.state_dict().items())
+    assert LAHNGridCells(config, batch=2).rates.shape == (2, *first.rates.shape)
 
 
 def test_development_in_two_parts_is_development_in_one():

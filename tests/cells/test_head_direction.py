@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from neuroslam.cells.convolve import circulant, ring_convolve
 from neuroslam.cells.head_direction import (
+    CompassReading,
     HeadDirectionCells,
     HeadDirectionConfig,
-    Heard,
     bump_at,
     decode_heading,
     frame_turn,
@@ -19,12 +19,12 @@ from neuroslam.cells.head_direction import (
     make_ring,
     respond,
     ring_step,
-    tuning_width,
     turned,
     turned_kernels,
 )
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, MapError
+from neuroslam.evaluation.tuning import tuning_width
 from neuroslam.geometry import wrap_angle
 from neuroslam.state.join import Join
 from neuroslam.types import NO_TEMPLATE, Frame, Motion, Pose, ViewMatch
@@ -112,7 +112,7 @@ def test_to_first_order_the_odd_part_is_the_derivative_of_the_even_one(turn):
 
 def test_a_bump_persists_for_ten_minutes_without_input():
     cells = HeadDirectionCells()
-    cells.place(0.4321)  # between two cells
+    cells.set_heading(0.4321)  # between two cells
     width = tuning_width(cells.rates)
     still(cells, 600.0)
     assert apart_deg(cells.heading_rad, 0.4321) < 1e-6
@@ -261,9 +261,9 @@ def test_a_batch_is_its_animals_one_by_one():
     together = HeadDirectionCells(batch=3)
     single = [HeadDirectionCells() for _ in range(3)]
     for _ in range(30):
-        together.advance(Motion(0.0, rates, DT), Heard(compass))
+        together.advance(Motion(0.0, rates, DT), CompassReading(compass))
         for one, rate, heading in zip(single, rates.tolist(), compass.tolist(), strict=True):
-            one.advance(Motion(0.0, rate, DT), Heard(heading))
+            one.advance(Motion(0.0, rate, DT), CompassReading(heading))
     for one, activity in zip(single, together.activity, strict=True):
         torch.testing.assert_close(activity, one.activity, rtol=0, atol=1e-12)
 
@@ -273,9 +273,9 @@ def test_a_batch_is_its_animals_one_by_one():
 
 def test_the_first_compass_reading_says_how_the_ring_lies():
     cells = HeadDirectionCells()
-    cells.see(new(0), DT)
+    cells.update_from_view(new(0), DT)
     cells.advance(Motion(0.0, 0.4, 1.0))
-    assert cells.advance(Motion(0.0, 0.0, DT), Heard(2.0)) == 0.0
+    assert cells.advance(Motion(0.0, 0.0, DT), CompassReading(2.0)) == 0.0
     assert apart_deg(cells.heading_rad, 2.0) < 1e-3
     assert apart_deg(cells.views["heading_rad"].item(), 1.6) < 1e-3  # learnt 0.4 rad before
 
@@ -319,9 +319,9 @@ def test_a_far_cue_that_is_gone_soon_changes_nothing():
 
 def test_a_weak_cue_never_wins_against_a_far_bump():
     cells = HeadDirectionCells(HeadDirectionConfig(compass_s=8.0))
-    cells.advance(Motion(0.0, 0.0, DT), Heard(0.0))
+    cells.advance(Motion(0.0, 0.0, DT), CompassReading(0.0))
     for _ in range(1200):
-        cells.advance(Motion(0.0, 0.0, DT), Heard(math.pi))
+        cells.advance(Motion(0.0, 0.0, DT), CompassReading(math.pi))
     assert apart_deg(cells.heading_rad, 0.0) < 1e-3
 
 
@@ -329,11 +329,13 @@ def test_with_a_compass_the_error_is_that_of_the_filter_it_makes():
     n, drift, heard = 256, math.radians(20.0) * DT, math.radians(10.0)
     cells = HeadDirectionCells(batch=n)
     draw = torch.Generator().manual_seed(1)
-    cells.advance(Motion(0.0, torch.zeros(n), DT), Heard(torch.zeros(n, dtype=torch.float64)))
+    cells.advance(
+        Motion(0.0, torch.zeros(n), DT), CompassReading(torch.zeros(n, dtype=torch.float64))
+    )
     squares = []
     for k in range(800):
         walk, error = torch.randn(2, n, generator=draw, dtype=torch.float64)
-        cells.advance(Motion(0.0, drift / DT * walk, DT), Heard(heard * error))
+        cells.advance(Motion(0.0, drift / DT * walk, DT), CompassReading(heard * error))
         if k >= 300 and k % 20 == 0:
             squares.append(cells.heading_rad.square().mean().item())
     share = 1.0 - math.exp(-DT / CONFIG.compass_s)
@@ -364,28 +366,28 @@ def test_known_views_hold_a_drifting_heading():
 
 def test_a_view_that_is_seen_on_and_on_lets_the_animal_turn():
     cells = HeadDirectionCells(HeadDirectionConfig(inject_after=0))
-    cells.see(new(0), DT)
+    cells.update_from_view(new(0), DT)
     rate = math.radians(10.0)
     for _ in range(100):
         cells.advance(Motion(0.0, rate, DT))
-        cells.see(known(0), DT)
+        cells.update_from_view(known(0), DT)
     held = rate * 100 * DT - cells.heading_rad
     assert 0.0 < held < rate * CONFIG.fatigue_s  # of the 50 degrees it turned, at most 5
 
 
 def test_a_panoramic_view_recalls_the_heading_it_is_seen_at():
     cells = HeadDirectionCells(HeadDirectionConfig(inject_after=0))
-    cells.place(1.0)
+    cells.set_heading(1.0)
     cells.bind(new(0, relative=0.0))
-    cells.place(1.4)
+    cells.set_heading(1.4)
     assert cells.turn_of(known(0, relative=0.5)) == pytest.approx(0.1)
 
 
 def test_recalling_changes_nothing_and_the_newest_views_recall_nothing():
     cells = HeadDirectionCells(HeadDirectionConfig(inject_after=2))
     for template in range(3):
-        cells.see(new(template), DT)
-    cells.place(0.7)
+        cells.update_from_view(new(template), DT)
+    cells.set_heading(0.7)
     before = {name: value.clone() for name, value in cells.state_dict().items()}
     assert cells.turn_of(known(0)) == pytest.approx(-0.7)
     assert cells.turn_of(known(1)) is None
@@ -397,7 +399,7 @@ def test_recalling_changes_nothing_and_the_newest_views_recall_nothing():
 @settings(max_examples=20, deadline=None)
 def test_a_correction_of_others_turns_the_heading_by_it_and_no_memory(turn):
     cells = HeadDirectionCells()
-    cells.see(new(0), DT)
+    cells.update_from_view(new(0), DT)
     cells.turn_by(turn)
     assert apart_deg(cells.heading_rad, turn) < 0.001
     assert cells.views["heading_rad"].tolist() == pytest.approx([0.0], abs=1e-6)
@@ -406,9 +408,9 @@ def test_a_correction_of_others_turns_the_heading_by_it_and_no_memory(turn):
 def test_views_of_another_life_are_refused():
     cells = HeadDirectionCells()
     with pytest.raises(MapError, match="new view 3, expected 0"):
-        cells.see(new(3), DT)
+        cells.update_from_view(new(3), DT)
     with pytest.raises(MapError, match="view 0 was never learnt, there are 0"):
-        cells.see(known(0), DT)
+        cells.update_from_view(known(0), DT)
 
 
 def test_a_bad_compass_is_refused_before_anything_changes():
@@ -416,7 +418,7 @@ def test_a_bad_compass_is_refused_before_anything_changes():
     with pytest.raises(BadFrame, match="heading nan rad; expected a finite number"):
         cells.observe(Frame(0, 0.0, heading_rad=math.nan))
     assert cells.observe(Frame(0, 0.0)) is None
-    assert cells.observe(Frame(0, 0.0, heading_rad=0.5)) == Heard(0.5)
+    assert cells.observe(Frame(0, 0.0, heading_rad=0.5)) == CompassReading(0.5)
 
 
 @pytest.mark.parametrize(
@@ -430,7 +432,7 @@ def test_a_bad_compass_is_refused_before_anything_changes():
 )
 def test_activity_that_is_none_is_refused(activity, said):
     with pytest.raises(MapError, match=said):
-        HeadDirectionCells().restore(activity)
+        HeadDirectionCells().set_activity(activity)
 
 
 @pytest.mark.parametrize("wrong", [{"n": 4}, {"settle_s": 0.0}, {"inhibition": 2.0}, {"m": 1}])
@@ -467,7 +469,7 @@ def test_gradients_flow_through_a_step_to_what_it_is_made_of():
 
 def a_life(config=None, views=12, seed=0, start=0.0):
     cells, rng = HeadDirectionCells(config), np.random.default_rng(seed)
-    cells.place(start)
+    cells.set_heading(start)
     for template in range(views):
         cells(Motion(0.2, rng.normal(), 0.3), new(template))
     return cells
@@ -488,7 +490,7 @@ def test_a_life_that_is_saved_and_loaded_goes_on_bit_for_bit():
 def test_loading_forgets_the_heading_that_was_decoded():
     cells = HeadDirectionCells()
     other = HeadDirectionCells()
-    other.place(1.0)
+    other.set_heading(1.0)
     assert cells.heading_rad == pytest.approx(0.0, abs=1e-9)
     cells.load_state_dict(other.state_dict())
     assert cells.heading_rad == pytest.approx(1.0, abs=1e-6)
@@ -546,7 +548,7 @@ def test_merging_with_an_empty_life_changes_nothing_that_was_learnt():
 def test_two_lives_with_a_compass_have_one_frame_already():
     lives = [a_life(seed=seed) for seed in (0, 1)]
     for life, heading in zip(lives, (0.5, -2.0), strict=True):
-        life.advance(Motion(0.0, 0.0, DT), Heard(heading))
+        life.advance(Motion(0.0, 0.0, DT), CompassReading(heading))
     loaded, partial = (life.state_dict() for life in lives)
     merged = HeadDirectionCells().merged(loaded, partial, join_of(12 + np.arange(12), 12, turn=1.0))
     assert_same_angles(headings(merged), [*headings(loaded), *headings(partial)])
@@ -555,7 +557,7 @@ def test_two_lives_with_a_compass_have_one_frame_already():
 
 def test_a_life_without_compass_comes_into_the_frame_of_one_with_it():
     loaded, partial = a_life(views=2), a_life(views=2)
-    partial.advance(Motion(0.0, 0.0, DT), Heard(2.0))
+    partial.advance(Motion(0.0, 0.0, DT), CompassReading(2.0))
     join = join_of([0, 1], 2)
     apart = frame_turn(loaded.state_dict(), partial.state_dict(), join)
     merged = HeadDirectionCells().merged(loaded.state_dict(), partial.state_dict(), join)
@@ -596,7 +598,7 @@ def test_what_is_told_of_the_cells_is_what_they_are():
     assert cells.counts() == {"head_direction_cells": 120, "head_direction_views": 12}
     assert cells.scalars()["head_direction/heading_rad"] == pytest.approx(cells.heading_rad)
     assert cells.scalars()["head_direction/bump_share"] == pytest.approx(1.0, abs=1e-6)
-    cells.place(math.pi / 2)  # up: rows of a picture of activity point up
+    cells.set_heading(math.pi / 2)  # up: rows of a picture of activity point up
     picture = cells.images()["cells/head_direction"]
     row, column = np.unravel_index(picture.argmax(), picture.shape)
     assert row > 48

@@ -336,8 +336,8 @@ def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(MapError, match=r"shape \(3, 3, 3\), expected \(36, 21, 21\)"):
         cells.activity = torch.zeros(3, 3, 3)
     with pytest.raises(MapError, match="view 5 is not bound, there are 0"):
-        cells.see(known_view(cells, 5))
-    with pytest.raises(ValueError, match="must be odd"):
+        cells.update_from_view(known_view(cells, 5))
+    with pytest.raises(ValueError, match="expected an odd number"):
         PoseCellConfig(excite_size=6)
     assert issubclass(ConfigError, ValueError)
 

@@ -6,9 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroslam.cells import walls as walls_module
+from neuroslam.cells import wall_table
+from neuroslam.cells.boundary import check_motion
 from neuroslam.cells.boundary_vectors import Wall, squared_mismatch, wall_innovation, wrap
-from neuroslam.cells.walls import OWN, WallMemory, check_motion
+from neuroslam.cells.wall_table import OWN
+from neuroslam.cells.walls import WallMemory
 from neuroslam.config import WallMemoryConfig
 from neuroslam.errors import BadFrame
 from neuroslam.worlds.arena import Arena, named_arena
@@ -52,7 +54,7 @@ class Path:
         positions, corrections = [], []
         for k, dt in enumerate(dt_s):
             position = position + self.memory.move(speed[:, k], heading[:, k], dt)
-            correction = self.memory.look(
+            correction = self.memory.update_from_walls(
                 position, wall_m[:, k], bearing[:, k] + heading[:, k, None], compass=compass
             )
             position = position + correction
@@ -167,7 +169,7 @@ def memory_of_one_wall(bearing, way, **config):
     """An animal that saw a wall 0.2 m off, and then went the way, as it believes."""
     memory = WallMemory(WallMemoryConfig(**{**ALIKE, **config}))
     at = torch.zeros(2, dtype=torch.float64)
-    memory.look(at, tensor([0.2]), tensor([bearing]))
+    memory.update_from_walls(at, tensor([0.2]), tensor([bearing]))
     length, course = way
     at = at + memory.move(tensor(length), tensor(course), 1.0)
     return memory, at
@@ -185,7 +187,7 @@ def test_a_wall_corrects_across_it_and_never_along(bearing, way, wrong):
     along = tensor([-math.sin(bearing), math.cos(bearing)])
     spread = memory.covariance.clone()
     distance = 0.2 - at @ normal + wrong
-    correction = memory.look(at, distance.clamp_min(0.0)[None], tensor([bearing]))
+    correction = memory.update_from_walls(at, distance.clamp_min(0.0)[None], tensor([bearing]))
     wrong = distance.clamp_min(0.0) - (0.2 - at @ normal)
     assert abs((correction @ along).item()) < 1e-12
     share = -(correction @ normal).item()
@@ -198,31 +200,31 @@ def test_a_wall_corrects_across_it_and_never_along(bearing, way, wrong):
 
 def test_a_wall_far_beyond_all_errors_is_another_and_corrects_nothing():
     memory, at = memory_of_one_wall(0.0, (0.05, math.pi / 2))
-    assert memory.look(at, tensor([0.9]), tensor([0.0])).tolist() == [0.0, 0.0]
+    assert memory.update_from_walls(at, tensor([0.9]), tensor([0.0])).tolist() == [0.0, 0.0]
 
 
 def test_a_look_too_soon_or_at_nothing_tells_nothing():
     memory, at = memory_of_one_wall(0.0, (0.1, 0.0), period_s=5.0)
     assert not memory.is_due
-    assert memory.look(at, tensor([0.1]), tensor([0.0])).tolist() == [0.0, 0.0]
+    assert memory.update_from_walls(at, tensor([0.1]), tensor([0.0])).tolist() == [0.0, 0.0]
     memory.move(tensor(0.0), tensor(0.0), 4.0)
     assert memory.is_due
-    assert memory.look(at, tensor([math.inf]), tensor([0.0])).tolist() == [0.0, 0.0]
-    assert memory.look(at, torch.empty(0), torch.empty(0)).tolist() == [0.0, 0.0]
+    assert memory.update_from_walls(at, tensor([math.inf]), tensor([0.0])).tolist() == [0.0, 0.0]
+    assert memory.update_from_walls(at, torch.empty(0), torch.empty(0)).tolist() == [0.0, 0.0]
 
 
 def test_who_may_not_learn_remembers_no_wall():
     memory = WallMemory(WallMemoryConfig(), batch=2)
     memory.move(torch.zeros(2), torch.zeros(2), 1.0)
     at, wall = torch.zeros(2, 2), torch.tensor([[0.1], [0.1]])
-    memory.look(at, wall, torch.zeros(2, 1), learns=torch.tensor([True, False]))
+    memory.update_from_walls(at, wall, torch.zeros(2, 1), learns=torch.tensor([True, False]))
     assert memory.n_walls.tolist() == [1, 0]
     assert [len(wall.x_m) for wall in memory.remembered()] == [1, 0]
 
 
 def test_a_wall_is_remembered_as_it_was_seen():
     memory = WallMemory(WallMemoryConfig(period_s=0.0))
-    memory.look(tensor([0.3, -0.4]), tensor([0.12]), tensor([2.0]))
+    memory.update_from_walls(tensor([0.3, -0.4]), tensor([0.12]), tensor([2.0]))
     (wall,) = memory.remembered()
     seen = [value.item() for value in wall]
     assert seen[:4] == pytest.approx([0.3, -0.4, 2.0, 0.12])
@@ -275,11 +277,11 @@ def test_what_was_long_known_speaks_against_the_place_when_it_is_missing_and_for
     ]
     for _ in range(600):
         memory.move(tensor(0.0), tensor(0.0), 0.2)
-        memory.look(at, wall, east)
-    against, speaks_for = memory.evidence(at[None], wall[None], east[None], 0.18)
-    assert (against.item(), speaks_for.item()) == (False, True)
-    against, speaks_for = memory.evidence(at[None], nothing[None], east[None], 0.18)
-    assert (against.item(), speaks_for.item()) == (True, False)
+        memory.update_from_walls(at, wall, east)
+    against, supports = memory.evidence(at[None], wall[None], east[None], 0.18)
+    assert (against.item(), supports.item()) == (False, True)
+    against, supports = memory.evidence(at[None], nothing[None], east[None], 0.18)
+    assert (against.item(), supports.item()) == (True, False)
 
 
 def test_who_forgets_the_position_keeps_the_walls_and_what_was_learnt():
@@ -332,7 +334,7 @@ def test_all_noise_off_but_that_of_the_walls_does_little_harm():
 
 @pytest.mark.parametrize(("noise", "bound_m"), [(NO_NOISE, 1e-6), (SenseNoise(), 0.08)])
 def test_with_room_for_few_walls_they_are_swapped_out_and_in(monkeypatch, noise, bound_m):
-    monkeypatch.setattr(walls_module, "ACTIVE", 10)
+    monkeypatch.setattr(wall_table, "ACTIVE", 10)
     seen = set()
 
     def watch(k, memory):
@@ -366,8 +368,8 @@ def test_more_walls_than_active_ones_still_keep_the_position():
     arena = Arena([(-0.5, -0.5), (4.0, -0.5), (4.0, 4.0), (-0.5, 4.0)], holes=boxes, name="boxes")
     walk = roam(arena, 8.0, np.random.default_rng(2), RATE_HZ, speed_m_s=0.25)
     path = Path(sense(walk, SenseNoise(), [0]))
-    assert path.memory.n_walls.item() > walls_module.ACTIVE
-    assert (path.memory.active >= 0).sum() == walls_module.ACTIVE
+    assert path.memory.n_walls.item() > wall_table.ACTIVE
+    assert (path.memory.active >= 0).sum() == wall_table.ACTIVE
     assert path.rmse_m < 0.8 * path.alone_m
     assert_is_a_covariance(path.memory)
 
@@ -393,8 +395,10 @@ def test_a_shifted_world_is_corrected_alike():
         at = at + here.move(speed[k], heading[k], dt_s)
         there.move(speed[k], heading[k], dt_s)
         look = wall_m[k], bearing[k] + heading[k]
-        correction = here.look(at, *look)
-        torch.testing.assert_close(there.look(at + shift, *look), correction, rtol=0, atol=1e-9)
+        correction = here.update_from_walls(at, *look)
+        torch.testing.assert_close(
+            there.update_from_walls(at + shift, *look), correction, rtol=0, atol=1e-9
+        )
         at = at + correction
     assert here.n_walls.item() > 5
 
@@ -440,7 +444,7 @@ def test_motion_that_cannot_be_is_refused_in_one_line(speed, heading):
     with pytest.raises(BadFrame) as caught:
         check_motion(torch.tensor(speed), torch.tensor(heading))
     assert str(caught.value) == (
-        f"motion: speed {speed:g} m/s, heading {heading:g} rad; expected finite numbers"
+        f"motion: speed {speed:.6} m/s, heading {heading:.6} rad; expected finite numbers"
     )
 
 

@@ -16,6 +16,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 
+from neuroslam.brain import load_brain
 from neuroslam.cli import main, output
 from neuroslam.config import preset_names
 from neuroslam.runs.inspect import inspect
@@ -91,16 +92,16 @@ def sources(tmp_path_factory):
     ("source", "cause"),
     [
         ("missing.avi", r"missing\.avi: no such file or folder; expected a video, "),
-        ("text.mp4", r"text\.mp4: is not a video that can be read"),
-        ("empty.avi", r"empty\.avi: is not a video that can be read"),
-        ("head.avi", r"head\.avi: is not a video that can be read, or is truncated"),
+        ("text.mp4", r"text\.mp4: cannot be read"),
+        ("empty.avi", r"empty\.avi: cannot be read"),
+        ("head.avi", r"head\.avi: cannot be read; expected a complete video"),
         ("none.avi", r"none\.avi: "),
-        ("nothing", r"nothing: holds no pictures"),
+        ("nothing", r"nothing: contains no images"),
         ("notes.pdf", r"notes\.pdf: is of no known kind"),
         ("empty.csv", r"empty\.csv: "),
         ("nan.csv", r"nan\.csv: frame 0 \(line 2\): its motion is v = nan m/s"),
         ("short.csv", r"short\.csv: line 2 "),
-        ("world:corridr", r"world 'corridr': there is none.*did you mean 'corridor'\?"),
+        ("world:corridr", r"world 'corridr': no such world.*did you mean 'corridor'\?"),
         ("arena:cirle2m", r"no arena is named 'cirle2m'.*did you mean 'circle2m'\?"),
         (
             "http://example.com/x.mp4",
@@ -188,7 +189,7 @@ LINES = [f"{i / 10!r},1.0,0.1" for i in range(8)]
         ("0.5,1.0,inf", r"frame 5 \(line 7\): its motion is v = 1\.0 m/s, w = inf", 1),
         ("0.2,1.0,0.1", r"frame 5: its time 0\.2 s is not after 0\.4 s", 1),
         ("nan,1.0,0.1", r"frame 5: its time is nan", 1),
-        ("9.5,1.0,0.1", r"frame 5: 9\.1 s after frame 4, more than max_gap_s = 2", 3),
+        ("9.5,1.0,0.1", r"frame 5: 9\.1 s after frame 4; expected at most max_gap_s = 2", 3),
     ],
 )
 def test_a_bad_line_of_motion_stops_the_run_or_is_skipped(row, cause, left_out, tmp_path, call):
@@ -226,7 +227,9 @@ def test_a_truncated_video_is_mapped_as_far_as_it_goes(tmp_path, call):
     stopped = call("run", tmp_path / "cut.avi", "-o", tmp_path / "stop", QUICK)
     assert stopped.code == 2
     assert stopped.err.count("\n") == 1
-    assert re.search(r"cut\.avi: frame \d+ .*truncated\?", stopped.err), stopped.err
+    assert re.search(r"cut\.avi: frame \d+ is missing; .*file is complete", stopped.err), (
+        stopped.err
+    )
     frames = len(read_frames(tmp_path / "stop")["frame"])
     assert 5 < frames < 15
     skipped = call(
@@ -262,7 +265,7 @@ def test_a_source_whose_every_frame_is_bad_has_no_usable_frame(earlier, tmp_path
 
 def test_an_empty_name_is_no_source(sources, tmp_path, monkeypatch, mistake):
     monkeypatch.chdir(sources / "good")
-    assert "the source has an empty name" in mistake("run", "", "-o", tmp_path / "out")
+    assert "the name of the source is empty" in mistake("run", "", "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -278,16 +281,19 @@ def test_a_camera_that_shows_nothing_closes_no_loop(grey, tmp_path, call):
     motion(folder / "odometry.csv", rows)
     done = call("run", folder, "-o", tmp_path / "run", QUICK)
     assert done.code == 0
-    assert "No places: no picture has the contrast that view.min_contrast asks for\n" in done.out
+    assert "No experiences: no image reaches the contrast view.min_contrast\n" in done.out
     again = call("resume", tmp_path / "run", QUICK)
-    assert "No places: no picture has the contrast" in again.out
+    assert "No experiences: no image reaches the contrast" in again.out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["templates"], metrics["loop_closures"]) == (80, 0, 0)
 
 
-def test_motion_alone_gives_no_places_for_want_of_pictures(tmp_path, call):
+def test_motion_without_images_gives_no_experiences(tmp_path, call):
     done = call("run", motion(tmp_path / "log.csv", LINES), "-o", tmp_path / "run", QUICK)
-    assert "No places: there were no pictures. Without a camera: --preset slrb\n" in done.out
+    assert (
+        "No experiences: the source has no images. Without a camera, use --preset slrb\n"
+        in done.out
+    )
 
 
 def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
@@ -295,8 +301,8 @@ def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
     source = f"{video(tmp_path / 'drive.avi', 40)}+{tmp_path}/log.csv"
     motion(tmp_path / "log.csv", [f"{i / 20!r},1.0,0.1" for i in range(10, 21)])
     done = call("run", source, "-o", tmp_path / "run", QUICK, "--stop", 5)
-    early = "motion begins at 0.5 s; 10 pictures before it were not used"
-    late = "motion ends at 1 s; 19 pictures after it were not used"
+    early = "motion begins at 0.5 s; 10 images before it were not used"
+    late = "motion ends at 1 s; 19 images after it were not used"
     assert done.code == 0
     assert (early in done.out, late in done.out) == (True, False)
     done = call("resume", tmp_path / "run", QUICK)
@@ -309,7 +315,7 @@ def test_pictures_outside_the_time_of_the_motion_are_told_once(tmp_path, call):
 def test_a_run_is_not_overwritten_unasked(earlier, mistake):
     before = contents(earlier)
     said = mistake("run", WORLD, "-o", earlier)
-    assert re.search(rf"{earlier}: holds a run already.*; resume it, take another .*--over", said)
+    assert re.search(rf"{earlier}: holds a run already.*; resume it, choose another .*--over", said)
     assert contents(earlier) == before
 
 
@@ -390,15 +396,15 @@ def test_a_brain_that_cannot_be_loaded_is_named_and_left_as_it_is(damage, cause,
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
-        ("config.toml", None, r"config\.toml: is missing, and says what the run reads"),
-        ("config.toml", b"[view]\n", r"config\.toml: has no usable \[run\] table"),
-        ("config.toml", b"\xff\xfe", r"config\.toml: has no usable \[run\] table"),
-        ("metrics.json", None, r"metrics\.json: missing; is "),
+        ("config.toml", None, r"config\.toml: missing; it holds the source of the run"),
+        ("config.toml", b"[view]\n", r"config\.toml: has no valid \[run\] table"),
+        ("config.toml", b"\xff\xfe", r"config\.toml: has no valid \[run\] table"),
+        ("metrics.json", None, r"metrics\.json: missing; expected the folder of a run"),
         ("metrics.json", b"[]", r"metrics\.json: damaged"),
         ("frames.csv", None, r"frames\.csv: .*cannot resume"),
         ("frames.csv", b"frame\n0\n", r"frames\.csv: damaged, 0 whole rows; .* seen 12 frames"),
         ("trace.f64", None, r"trace\.f64: .*cannot resume"),
-        ("trace.f64", b"12345", r"trace\.f64: shorter than the run"),
+        ("trace.f64", b"12345", r"trace\.f64: 0 rows, the brain has seen 12 frames"),
     ],
 )
 def test_a_part_of_a_run_that_is_missing_or_damaged_is_named(
@@ -422,7 +428,7 @@ def test_what_is_not_a_run_can_be_neither_resumed_nor_drawn_nor_evaluated(tmp_pa
 
 
 @pytest.mark.parametrize("cut", [-1, -9, -60])
-def test_a_row_that_was_cut_off_is_told_alike_by_all_who_read_it(cut, earlier, mistake):
+def test_every_reader_reports_an_incomplete_row_alike(cut, earlier, mistake):
     rows = (earlier / "frames.csv").read_text()
     (earlier / "frames.csv").write_text(rows[:cut])
     told = f"{earlier}/frames.csv: damaged, 11 whole rows; the brain has seen 12 frames"
@@ -434,13 +440,17 @@ def test_a_row_that_was_cut_off_is_told_alike_by_all_who_read_it(cut, earlier, m
 @pytest.mark.parametrize(
     ("file", "inside", "told"),
     [
-        ("sweep.json", "1-a/frames.csv", "a sweep; its runs are folders in it, as {}/1-a"),
-        ("fleet.json", "merged/frames.csv", "a fleet; its map is in {}/merged"),
+        (
+            "sweep.json",
+            "1-a/frames.csv",
+            "a sweep; expected one of its runs, which are folders in it, e.g. {}/1-a",
+        ),
+        ("fleet.json", "merged/frames.csv", "a fleet; its merged map is in {}/merged"),
         ("fleet.json", "sessions/1/frames.csv", "a fleet; its maps are in {}/sessions"),
-        ("tune.json", "config.toml", "a tuning; use it as --config {}/config.toml"),
+        ("tune.json", "config.toml", "a tuning; use its config with --config {}/config.toml"),
     ],
 )
-def test_a_folder_of_many_runs_is_told_from_a_run(file, inside, told, tmp_path, mistake):
+def test_a_folder_of_many_runs_is_not_taken_for_a_run(file, inside, told, tmp_path, mistake):
     out = tmp_path / "out"
     (out / inside).parent.mkdir(parents=True)
     (out / inside).touch()
@@ -464,14 +474,14 @@ def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
     (tmp_path / "half.tum").write_text("".join(rows[:6]))
     done = call("evaluate", finished, "--truth", tmp_path / "half.tum")
     assert (done.code, done.err) == (0, "")
-    assert done.out.endswith("6 of 12 frames have truth; the errors are theirs\n")
+    assert done.out.endswith("6 of 12 frames have a true pose; the errors are over those\n")
     assert "have truth" not in call("evaluate", finished).out
 
 
 def test_evaluate_asks_for_a_truth_where_there_is_none(finished, tmp_path, call, mistake):
     source = motion(tmp_path / "log.csv", LINES)
     assert call("run", source, "-o", tmp_path / "run", QUICK).code == 0
-    assert "give one with --truth FILE" in mistake("evaluate", tmp_path / "run")
+    assert "give a TUM file with --truth FILE" in mistake("evaluate", tmp_path / "run")
     assert "nowhere.tum" in mistake("evaluate", tmp_path / "run", "--truth", "nowhere.tum")
     assert "--align rgid: expected one of " in mistake("evaluate", finished, "--align", "rgid")
     (tmp_path / "run" / "trace.f64").write_bytes(b"12345")
@@ -503,11 +513,24 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     assert (done.code, done.err) == (0, "")
     first, error, written = done.out.splitlines()
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
-    assert "error against the truth" in error
+    assert "ATE (rigid): map " in error
     assert written == f"Written: {out}"
 
 
-def test_one_is_told_in_the_singular(tmp_path, call):
+def test_an_old_name_of_a_key_is_read_and_told_in_one_line(tmp_path, call):
+    out = tmp_path / "run"
+    done = call("run", WORLD, "-o", out, "--stop", 3, QUICK, "--set", "sessions.carried=ignore")
+    assert done.code == 0
+    assert done.err == (
+        "neuroslam run: note: sessions: carried is called kidnapped now; the old name is read "
+        "until the next release\n"
+    )
+    assert load_brain(out / "brain.safetensors").config.sessions.kidnapped == "ignore"
+    again = call("resume", out, QUICK)
+    assert (again.code, again.err) == (0, "")  # what was written has the new name
+
+
+def test_a_count_of_one_is_singular(tmp_path, call):
     done = call("run", WORLD, "-o", tmp_path / "run", "--stop", 1, QUICK)
     assert re.match(
         r"1 frame at \d+ frames?/s: 1 template, 1 experience, 0 links, 0 loop closures", done.out
@@ -527,7 +550,7 @@ def test_evaluate_plot_and_presets_print_tables(finished, tmp_path, call):
     assert (presets.code, "irat" in presets.out) == (0, True)
 
 
-def test_words_of_a_table_are_never_cut(monkeypatch, capsys):
+def test_cells_of_a_table_are_never_truncated(monkeypatch, capsys):
     told = "".join(sorted(preset_names()))
     monkeypatch.setattr(output, "console", Console(width=30))
     assert main(["presets"]) == 0
@@ -540,7 +563,7 @@ def test_words_of_a_table_are_never_cut(monkeypatch, capsys):
     )
 
 
-def test_the_version_is_told(call):
+def test_the_version_is_printed(call):
     assert call("--version").out == f"neuroslam {version('neuroslam')}\n"
 
 
@@ -579,7 +602,7 @@ def test_neuroslam_alone_lists_the_commands(call):
         (["resume"], "Missing argument 'DIR'"),
     ],
 )
-def test_typing_mistakes_are_explained(arguments, cause, tmp_path, monkeypatch, call):
+def test_typing_errors_are_explained(arguments, cause, tmp_path, monkeypatch, call):
     monkeypatch.chdir(tmp_path)
     done = call(*arguments)
     assert (done.code, done.out) == (2, "")

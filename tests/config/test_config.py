@@ -4,6 +4,7 @@ import importlib.util
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
@@ -11,6 +12,9 @@ from neuroslam.cells import NavigationCells
 from neuroslam.config import (
     CLASSIC_NAMES,
     BrainConfig,
+    GridCellConfig,
+    PoseCellConfig,
+    ViewConfig,
     build_config,
     merge_values,
     parse_assignment,
@@ -19,10 +23,10 @@ from neuroslam.config import (
     read_preset,
     to_toml,
 )
-from neuroslam.config.sections import GridCellConfig, PoseCellConfig, ViewConfig
 from neuroslam.config.semantic import SSPSpaceConfig
-from neuroslam.errors import ConfigError
+from neuroslam.errors import ConfigError, RenamedKeyWarning
 from neuroslam.runs.run import resolve_config
+from neuroslam.sensors import open_source
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -31,7 +35,7 @@ def test_every_preset_is_a_config_and_survives_toml(name):
     assert build_config(tomllib.loads(to_toml(config))) == config
 
 
-def test_the_presets_the_data_need_are_there():
+def test_presets_exist_for_the_published_data():
     wanted = {"openratslam", "irat", "new_college", "lab_tour", "virtual_tour", "rc_car"}
     assert wanted <= set(preset_names())
 
@@ -71,14 +75,14 @@ def test_the_presets_the_data_need_are_there():
         ({"view": {"features": "gray"}}, r"features gray needs weights: .*; did you mean 'grey'\?"),
     ],
 )
-def test_what_cannot_be_used_is_said_in_one_line(values, message):
+def test_an_invalid_config_raises_one_line(values, message):
     with pytest.raises(ConfigError, match=message) as caught:
         build_config(values)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("make", "where", "said"),
+    ("make", "where", "message"),
     [
         (
             lambda: BrainConfig(veiw={}),
@@ -108,14 +112,14 @@ def test_what_cannot_be_used_is_said_in_one_line(values, message):
         (lambda: PoseCellConfig(mood="fine"), ("mood",), "unknown key 'mood'"),
     ],
 )
-def test_a_config_made_in_python_says_what_was_meant(make, where, said):
+def test_a_config_made_in_python_suggests_the_known_name(make, where, message):
     with pytest.raises(ValidationError) as caught:
         make()
     [error] = caught.value.errors()
-    assert (error["loc"], error["msg"]) == (where, said)
+    assert (error["loc"], error["msg"]) == (where, message)
 
 
-def test_what_else_is_wrong_is_told_after_unknown_keys():
+def test_other_errors_are_listed_after_unknown_keys():
     with pytest.raises(ValidationError) as caught:
         BrainConfig(map={"solver": "relx"}, threads=0, view={"threshold": 2, "crp": None})
     errors = caught.value.errors()
@@ -125,12 +129,12 @@ def test_what_else_is_wrong_is_told_after_unknown_keys():
     assert caught.value.title == "BrainConfig"
 
 
-def test_a_config_cannot_be_changed_after_it_was_checked():
+def test_a_config_is_frozen():
     with pytest.raises(ValueError, match="frozen"):
         BrainConfig().view.threshold = 3
 
 
-def test_the_later_wins():
+def test_later_values_replace_earlier_ones():
     over = merge_values(read_preset("rc_car"), parse_assignment("view.threshold=0.01"))
     config = build_config(over)
     assert config.view.threshold == 0.01
@@ -146,7 +150,57 @@ def test_assignments_read_toml_values():
         parse_assignment("nonsense")
 
 
-# --- parameters that must agree -----------------------------------------------------------------
+# --- names of the last release ------------------------------------------------------------------
+
+OLD_NAME = r"^sessions: carried is called kidnapped now; the old name is read until the next"
+
+
+def test_an_old_name_is_read_with_a_warning():
+    with pytest.warns(RenamedKeyWarning) as told:
+        config = build_config({"sessions": {"carried": "ignore", "carried_factor": 3.5}})
+    assert (config.sessions.kidnapped, config.sessions.kidnapped_factor) == ("ignore", 3.5)
+    assert len(told) == 2
+
+
+def test_a_file_and_an_assignment_with_an_old_name_are_read_with_a_warning(tmp_path):
+    (tmp_path / "old.toml").write_text('[sessions]\ncarried = "ignore"\n')
+    with pytest.warns(RenamedKeyWarning, match=OLD_NAME):
+        values = read_config_file(tmp_path / "old.toml")
+    assert values == {"sessions": {"kidnapped": "ignore"}}
+    with pytest.warns(RenamedKeyWarning, match=OLD_NAME):
+        assert parse_assignment("sessions.carried=detect") == {"sessions": {"kidnapped": "detect"}}
+
+
+def test_the_later_wins_whatever_name_it_has(tmp_path):
+    (tmp_path / "old.toml").write_text('[sessions]\ncarried = "detect"\n')
+    assert resolve_config("openratslam").sessions.kidnapped == "ignore"
+    with pytest.warns(RenamedKeyWarning):
+        over_preset = resolve_config("openratslam", None, ("sessions.carried=detect",))
+    with pytest.warns(RenamedKeyWarning):
+        over_file = resolve_config(None, tmp_path / "old.toml", ("sessions.kidnapped=ignore",))
+    base = BrainConfig(sessions={"kidnapped": "detect"})
+    with pytest.warns(RenamedKeyWarning):
+        over_base = resolve_config(None, None, ("sessions.carried=ignore",), base)
+    assert [c.sessions.kidnapped for c in (over_preset, over_file, over_base)] == [
+        "detect", "ignore", "ignore",
+    ]  # fmt: skip
+
+
+def test_two_names_of_one_key_are_refused():
+    with pytest.raises(ConfigError, match=r"unknown key 'sessions\.carried'"):
+        build_config({"sessions": {"carried": "ignore", "kidnapped": "detect"}})
+
+
+def test_a_world_reads_the_old_name_of_an_option_with_a_warning():
+    with pytest.warns(RenamedKeyWarning, match="carried is called kidnapped now"):
+        old = open_source("world:corridor?laps=1&frames_per_lap=60&carried=2:0.5")
+    new = open_source("world:corridor?laps=1&frames_per_lap=60&kidnapped=2:0.5")
+    np.testing.assert_array_equal(old.truths(), new.truths())
+    still = open_source("world:corridor?laps=1&frames_per_lap=60")
+    assert not np.array_equal(old.truths(), still.truths())
+
+
+# --- dependent parameters ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -194,30 +248,32 @@ def test_spacings_follow_the_number_of_orientations(orientations_deg, spacings_m
         ({"spacings_m": [-0.3]}, r"spacings_m has -0\.3; expected more than 0"),
     ],
 )
-def test_grid_modules_that_do_not_agree_are_one_line(values, message):
+def test_spacings_and_orientations_of_different_length_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
         build_config({"grid_cells": values})
 
 
-def test_cells_live_with_one_spacing_given():
+def test_navigation_cells_have_one_module_for_one_spacing():
     cells = NavigationCells(BrainConfig(grid_cells={"spacings_m": (0.25,), "n_cells": 4}))
     assert cells.grid.rates.shape == (1, 4)
 
 
 @pytest.mark.parametrize(("width", "shift"), [(2, 0), (5, 2), (8, 3), (9, 4), (60, 4)])
-def test_the_shift_follows_a_narrow_template(width, shift):
+def test_the_default_shift_fits_a_narrow_template(width, shift):
     assert ViewConfig(template_width=width).shift_match == shift
     with pytest.raises(ValidationError, match="leaves no column"):
         ViewConfig(template_width=width, shift_match=(width + 1) // 2)
 
 
-def test_the_dimension_follows_scales_that_are_given_for_each():
+def test_the_dimension_follows_the_length_of_scale_lists():
     assert SSPSpaceConfig(reach_m=(1.0, 2.0, 3.0)).dimension == 3
     assert SSPSpaceConfig(length_scale_m=(0.2, 0.3, 0.4), reach_m=(1.0, 2.0, 3.0)).dimension == 3
     assert SSPSpaceConfig(reach_m=2.0).dimension == 2
-    with pytest.raises(ValidationError, match="one number or 2 of them"):
+    with pytest.raises(ValidationError, match="expected one positive number or 2 of them"):
         SSPSpaceConfig(dimension=2, reach_m=(1.0, 2.0, 3.0))
-    with pytest.raises(ConfigError, match=r"space.dimension is 3; a brain lives in 2"):
+    with pytest.raises(
+        ConfigError, match=r"space.dimension is 3; expected 2: a brain maps a plane"
+    ):
         build_config({"semantic": {"space": {"reach_m": [1.0, 2.0, 3.0]}}})
 
 
@@ -260,7 +316,7 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
         ("a.toml", b"\xff\xfe\x00", "cannot be read as text"),
     ],
 )
-def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
+def test_the_error_names_a_file_that_cannot_be_read(tmp_path, name, text, message):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigError, match=message) as caught:
@@ -268,7 +324,7 @@ def test_files_that_cannot_be_used_are_named(tmp_path, name, text, message):
     assert name in str(caught.value)
 
 
-def test_missing_files_and_presets_are_named(tmp_path):
+def test_the_error_names_a_missing_file_or_preset(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         read_config_file(tmp_path / "none.toml")
     with pytest.raises(ConfigError, match=r"no such file; rc_car is a preset, --preset rc_car$"):
@@ -277,13 +333,13 @@ def test_missing_files_and_presets_are_named(tmp_path):
         read_preset("rc_cart")
 
 
-def test_every_classic_name_leads_to_a_field_of_ours():
+def test_every_openratslam_name_maps_to_a_config_field():
     config = BrainConfig()
     for section, name in CLASSIC_NAMES.values():
         assert hasattr(getattr(config, section), name)
 
 
-def test_the_page_of_parameters_is_up_to_date():
+def test_the_parameter_page_is_up_to_date():
     docs = Path(__file__).resolve().parents[2] / "docs"
     spec = importlib.util.spec_from_file_location("parameters", docs / "parameters.py")
     module = importlib.util.module_from_spec(spec)
@@ -302,5 +358,5 @@ def described(section, path=""):
             yield f"{path}{key}"
 
 
-def test_every_parameter_says_what_it_does():
+def test_every_parameter_has_a_description():
     assert "semantic.space.reach_m" in set(described(BrainConfig))

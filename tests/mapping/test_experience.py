@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
 from neuroslam.mapping import ExperienceMap
-from neuroslam.mapping.experience import choose_action
+from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.types import Motion, Pose, PoseEstimate, ViewMatch
 
@@ -23,7 +23,7 @@ def new_view(template):
 
 
 def square_lap(solver="relax", drift_rad=0.0, side=4, **config):
-    """Drive a square of four sides of ``side`` experiences, each a metre apart, and come home."""
+    """Drive a square, ``side`` experiences a metre apart on each side, and close the loop."""
     graph = ExperienceMap(MapConfig(solver=solver, initial_heading_deg=0.0, **config))
     graph.create(0, AT, frame=0)
     for step in range(1, 4 * side):
@@ -69,7 +69,7 @@ def test_a_link_keeps_what_odometry_measured():
     assert links.duration_s[0] == pytest.approx(2.0)
 
 
-def test_a_link_is_not_added_twice_in_either_direction_and_set_starts_anew():
+def test_a_link_is_not_added_twice_and_relocalising_resets_odometry():
     graph = ExperienceMap(MapConfig())
     graph.create(0, AT, frame=0)
     graph.move(Motion(1.0, 0.0, 1.0))
@@ -80,13 +80,13 @@ def test_a_link_is_not_added_twice_in_either_direction_and_set_starts_anew():
     graph.link(1)
     assert graph.n_links == 1
     graph.move(Motion(1.0, 0.0, 3.0))
-    graph.set(0)
+    graph.relocalise(0)
     assert graph.state.since_s == 0.0
     assert graph.offset == pytest.approx((0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("solver", ["relax", "least_squares"])
-def test_a_lap_without_drift_is_at_rest_where_it_was(solver):
+def test_relaxation_does_not_change_a_lap_without_drift(solver):
     graph = square_lap(solver)
     before = graph.poses
     graph.relax(2000)
@@ -102,16 +102,16 @@ def test_a_drifting_lap_closes(solver):
     assert loop_error_m(graph) < 0.3 * opened
 
 
-def test_a_map_without_loops_is_at_rest_and_costs_nothing():
+def test_a_map_without_loops_has_converged_and_is_not_relaxed():
     graph = ExperienceMap(MapConfig())
     for step in range(50):
         graph.move(Motion(1.0, 0.1, 1.0))
         graph.create(step, AT, frame=step)
         assert graph.relax() == 0.0
-    assert graph._relaxation is None  # nothing was even prepared
+    assert graph._relaxation is None  # not even prepared
 
 
-def test_relaxation_comes_to_rest():
+def test_relaxation_converges():
     graph = square_lap(drift_rad=0.02, rest_tolerance=1e-6)
     calls = 0
     while not graph.state.at_rest:
@@ -121,7 +121,7 @@ def test_relaxation_comes_to_rest():
     assert graph.relax() == 0.0
 
 
-def test_the_robot_keeps_its_place_relative_to_its_experience_when_the_map_moves():
+def test_the_robot_keeps_its_pose_relative_to_its_experience_when_the_map_moves():
     graph = square_lap(drift_rad=0.03)
     graph.move(Motion(0.7, 0.4, 1.0))
     before, pose = graph.offset, graph.pose
@@ -139,7 +139,7 @@ def test_actions_follow_view_and_cells():
     assert graph(step, ViewMatch(0, 0.01, 0.0, False), far, 2) == ("create", 1)
     assert graph(step, ViewMatch(0, 0.01, 0.0, False), AT, 3) == ("link", 0)
     assert graph(step, ViewMatch(-1, -1.0, 0.0, False), AT, 4) == ("none", 0)
-    assert graph.n_links == 1  # 0 -> 1; 1 -> 0 is the same way
+    assert graph.n_links == 1  # 0 -> 1; 1 -> 0 is the same link
 
 
 @given(shift=st.floats(-40, 40), n=st.sampled_from([21, 36]))
@@ -162,7 +162,7 @@ def test_a_panoramic_view_is_bound_with_the_heading_it_was_learnt_with():
     assert graph.pose.theta_rad == pytest.approx(math.pi / 2)
 
 
-def test_the_quickest_way_goes_by_time_and_both_ways():
+def test_the_quickest_path_uses_durations_and_both_directions():
     graph = ExperienceMap(MapConfig())
     for step, seconds in enumerate([1.0, 10.0, 1.0, 1.0, 1.0]):
         graph.move(Motion(1.0, 0.0, seconds))
@@ -183,14 +183,14 @@ def test_goals_are_visited_in_order_and_dropped_when_late():
     for _ in range(4):
         graph(Motion(0.0, 0.0, 1.0), ViewMatch(-1, -1.0, 0.0, False), AT, 99)
     assert graph.goals["experience"].tolist() == [2]
-    graph.set(2)
+    graph.relocalise(2)
     graph._drop_finished_goals()
     assert graph.next_waypoint() is None
     with pytest.raises(MapError, match="time-out of a goal is -1"):
         graph.add_goal(1, timeout_s=-1)
 
 
-def test_an_unreachable_goal_is_said_so_and_nothing_raised():
+def test_the_plan_to_an_unreachable_goal_has_the_reason():
     graph = ExperienceMap(MapConfig())
     graph.create(0, AT, frame=0)
     graph.state.current = -1
@@ -214,10 +214,10 @@ def test_distance_and_bearing_are_seen_from_the_robot():
         graph.distance_and_bearing(4)
 
 
-def test_what_closes_a_loop_is_not_the_way_a_place_was_found():
+def test_the_first_link_to_an_experience_closes_no_loop():
     graph = square_lap(loops=0)
     graph.move(Motion(1.0, 1.0, 1.0))
-    graph.create(99, AT, frame=99)  # a branch from an old place
+    graph.create(99, AT, frame=99)  # a branch from an old experience
     mask = closes_loop(*graph.links[:2])
     assert mask.sum() == 1
     assert (graph.links.source[mask], graph.links.target[mask]) == (15, 0)

@@ -13,7 +13,7 @@ from neuroslam.mapping.relax import Relaxation, relax_sequentially
 
 
 def links_between(poses, source, target, rng=None, sigma_m=0.0, sigma_rad=0.0):
-    """Links that say where each target is as seen from its source, with noise."""
+    """Links from each source to each target as measured, with noise."""
     apart = poses[target] - poses[source]
     bearing = np.arctan2(apart[:, 1], apart[:, 0])
     noise = np.zeros((2, len(source))) if rng is None else rng.normal(size=(2, len(source)))
@@ -88,7 +88,7 @@ def random_maps(draw):
 
 @settings(max_examples=150, deadline=None)
 @given(random_maps(), st.integers(1, 4))
-def test_relaxation_is_the_sequential_one(random_map, loops):
+def test_fast_relaxation_equals_sequential_relaxation(random_map, loops):
     poses, links, correction = random_map
     fast, _ = Relaxation(*links, n=len(poses)).run(poses, loops, correction)
     slow = relax_sequentially(poses, *links, loops=loops, correction=correction)
@@ -126,7 +126,7 @@ def test_relaxation_equals_the_reference_program(reference_map, loops):
     assert differ(relaxed, poses[loops]) < 1e-12
 
 
-def test_runs_can_be_cut_anywhere(reference_map):
+def test_a_run_split_in_two_gives_the_same_map(reference_map):
     links, poses = reference_map
     relaxation = Relaxation(*links, n=200)
     whole, _ = relaxation.run(poses[0], 30, 0.5)
@@ -135,7 +135,7 @@ def test_runs_can_be_cut_anywhere(reference_map):
     assert differ(whole, rest) < 1e-12
 
 
-def test_a_map_whose_links_agree_is_at_rest():
+def test_a_map_whose_links_agree_has_converged():
     rng = np.random.default_rng(0)
     truth, _, links, _ = laps(60, 3, 10, rng, sigma_m=0.0, sigma_rad=0.0)
     relaxed, moved = Relaxation(*links, n=60).run(truth, 20, 0.5, tolerance=1e-9)
@@ -143,14 +143,14 @@ def test_a_map_whose_links_agree_is_at_rest():
     assert differ(relaxed, truth) < 1e-9
 
 
-def test_contradictory_links_come_to_rest_too():
+def test_contradictory_links_converge_too():
     links = [np.array(v) for v in ([0, 0], [1, 1], [1.0, 2.0], [0.0, 0.0], [0.0, 0.0])]
     relaxed, moved = Relaxation(*links, n=2).run(np.zeros((2, 3)), 100, 0.5, tolerance=1e-12)
     assert moved < 1e-12
     assert 1.0 <= relaxed[1, 0] - relaxed[0, 0] <= 2.0
 
 
-def test_a_map_without_links_stays():
+def test_a_map_without_links_does_not_change():
     none, no = np.empty(0, np.int64), np.empty(0)
     poses = np.array([[1.0, 2.0, 0.5]])
     relaxed, moved = Relaxation(none, none, no, no, no, n=1).run(poses, 20, 0.5)
@@ -182,7 +182,7 @@ def test_the_jacobian_is_the_derivative_of_the_residuals(random_map):
     np.testing.assert_allclose(change.ravel(), predicted, atol=1e-9)
 
 
-def test_one_call_reaches_what_a_thousand_relaxation_loops_do_not(reference_map):
+def test_least_squares_has_less_error_than_a_thousand_relaxation_loops(reference_map):
     links, poses = reference_map
     relaxed, _ = Relaxation(*links, n=200).run(poses[0], 1000, 0.5)
     solved, report = solve_pose_graph(poses[0], *links)
@@ -192,7 +192,7 @@ def test_one_call_reaches_what_a_thousand_relaxation_loops_do_not(reference_map)
     assert report.cost == pytest.approx(squared_error(solved, *links))
 
 
-def test_one_call_closes_laps_that_odometry_left_open():
+def test_least_squares_closes_laps_better_than_relaxation():
     truth, odometry, links, _ = laps(600, 3, 60, np.random.default_rng(2), sigma_rad=0.02)
     relaxed, _ = Relaxation(*links, n=600).run(odometry, 1000, 0.5)
     solved, report = solve_pose_graph(odometry, *links, sigma_m=0.02, sigma_rad=0.02)
@@ -212,7 +212,7 @@ def test_links_without_error_give_the_truth_and_keep_the_first_pose():
     assert report.cost < 1e-12
 
 
-def test_a_link_with_unknown_facing_joins_places_and_leaves_headings():
+def test_a_link_with_unknown_facing_moves_positions_only():
     links = [np.array(v) for v in ([0, 1], [1, 0], [2.0, 0.0], [0.0, 0.0], [0.5, np.nan])]
     start = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.5]])
     solved, _ = solve_pose_graph(start, *links)
@@ -221,7 +221,7 @@ def test_a_link_with_unknown_facing_joins_places_and_leaves_headings():
     np.testing.assert_allclose(relaxed[:, 2], [0.0, 0.5], atol=1e-12)
 
 
-def test_confident_links_pull_harder():
+def test_confidence_weighs_as_inverse_variance():
     links = [np.array(v) for v in ([0, 0], [1, 1], [1.0, 2.0], [0.0, 0.0], [0.0, 0.0])]
     start = np.zeros((2, 3))
     by_confidence, _ = solve_pose_graph(start, *links, confidence=np.array([1.0, 0.25]))
@@ -230,7 +230,7 @@ def test_confident_links_pull_harder():
     np.testing.assert_allclose(by_sigma[1, 0], 1.2, atol=1e-6)
 
 
-def test_parts_that_nothing_joins_are_solved_apart():
+def test_unconnected_parts_are_solved_separately():
     links = [np.array(v) for v in ([0, 2], [1, 3], [1.0, 1.0], [0.0, 0.0], [0.0, 0.0])]
     start = np.array([[0, 0, 0], [3, 0, 0], [5, 5, 0], [7, 5, 0]], dtype=float)
     solved, _ = solve_pose_graph(start, *links)
@@ -243,29 +243,29 @@ def test_parts_that_nothing_joins_are_solved_apart():
 def test_laps_with_half_of_the_loops_false_are_solved_to_the_truth(seed, knows_facing):
     rng = np.random.default_rng(seed)
     _, odometry, links, false = laps(300, 3, 80, rng, false_share=0.5)
-    doubtful = np.arange(len(false)) >= 299
+    rejectable = np.arange(len(false)) >= 299
     if not knows_facing:
-        links[4][doubtful] = np.nan
+        links[4][rejectable] = np.nan
     sigma = {"sigma_m": 0.02, "sigma_rad": 0.005}
-    solved, report = solve_pose_graph(odometry, *links, **sigma, doubtful=doubtful)
+    solved, report = solve_pose_graph(odometry, *links, **sigma, rejectable=rejectable)
     ideal, _ = solve_pose_graph(odometry, *(link[~false] for link in links), **sigma)
-    believed = report.weights > 0
-    assert believed[~doubtful].all()
-    assert (believed & false).sum() <= 2  # a false loop between neighbours is hardly false
-    assert (believed & doubtful & ~false).sum() >= 0.9 * (doubtful & ~false).sum()
+    inlier = report.weights > 0
+    assert inlier[~rejectable].all()
+    assert (inlier & false).sum() <= 2  # a false loop between neighbours is hardly false
+    assert (inlier & rejectable & ~false).sum() >= 0.9 * (rejectable & ~false).sum()
     assert np.linalg.norm(solved[:, :2] - ideal[:, :2], axis=1).max() < 0.3
-    fooled, _ = solve_pose_graph(odometry, *links, **sigma)
-    assert np.linalg.norm(fooled[:, :2] - ideal[:, :2], axis=1).max() > 5.0
+    without_rejection, _ = solve_pose_graph(odometry, *links, **sigma)
+    assert np.linalg.norm(without_rejection[:, :2] - ideal[:, :2], axis=1).max() > 5.0
 
 
 def test_the_same_seed_gives_the_same_map():
     _, odometry, links, false = laps(120, 3, 40, np.random.default_rng(9), false_share=0.5)
-    doubtful = np.arange(len(false)) >= 119
-    first, second = (solve_pose_graph(odometry, *links, doubtful=doubtful)[0] for _ in range(2))
+    rejectable = np.arange(len(false)) >= 119
+    first, second = (solve_pose_graph(odometry, *links, rejectable=rejectable)[0] for _ in range(2))
     assert first.tobytes() == second.tobytes()
 
 
-def test_mistakes_are_named():
+def test_the_error_names_the_invalid_link_or_pose():
     links = [np.array([v]) for v in (0, 5, 1.0, 0.0, 0.0)]
     with pytest.raises(MapError, match="links end at poses 0 to 5, expected 0 to 1"):
         solve_pose_graph(np.zeros((2, 3)), *links)

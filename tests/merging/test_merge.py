@@ -24,7 +24,7 @@ from neuroslam.merging.states import make_join, merge_states
 from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
 from neuroslam.state.match import Match
-from neuroslam.state.population import Population
+from neuroslam.state.mergeable import Mergeable
 from neuroslam.state.sessions import Session
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
@@ -326,7 +326,7 @@ def corridor():
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corridor):
+def test_every_number_of_a_brain_belongs_to_a_part_with_a_rule(name, corridor):
     config = CONFIGS[name]
     lives = []
     for frames in (corridor[:40], corridor[20:]):
@@ -337,8 +337,9 @@ def test_every_number_of_a_brain_belongs_to_a_population_with_a_rule(name, corri
         lives.append(brain)
     loaded, partial = lives
     parts = partial.parts()
-    assert parts
-    assert all(isinstance(part, Population) for part in parts.values())
+    assert all(isinstance(part, Mergeable) for part in parts.values())
+    assert all(parts[one.name] is one for one in partial.populations.values())
+    assert parts.keys() > {one.name for one in partial.populations.values()}
     for key in partial.state_dict():
         top = key.split(".")[0]
         assert top in parts or top == "stored", key
@@ -379,7 +380,7 @@ def test_a_number_beside_all_parts_is_named_and_not_forgotten():
 
 
 def test_a_rule_that_forgets_a_number_is_named():
-    class Forgetful(Population):
+    class Forgetful(Mergeable):
         def __init__(self):
             super().__init__()
             self.register_buffer("kept", torch.zeros(1))
@@ -446,7 +447,7 @@ def test_one_match_places_and_renames_everything_and_changes_no_input(seed, u, z
 
 @given(seeds, st.integers(0, 10), st.integers(0, 10), turns)
 @few
-def test_what_links_measured_stays_true_whatever_heading_their_end_is_told_by(seed, u, z, turn):
+def test_link_measurements_hold_in_the_heading_of_the_merged_experience(seed, u, z, turn):
     """A link of the matched place is told relative to the heading of what that becomes."""
     loaded, partial = synthetic(seed, shared=True), synthetic(seed + 1, session=2, shared=True)
     merged, _ = loaded.merge(partial, Match(u, z, turn))
@@ -600,7 +601,7 @@ def test_places_folded_together_keep_one_view_each_and_every_link_once(seed, n_p
 
 @given(seeds, turns)
 @few
-def test_what_comes_out_is_sound(seed, turn):
+def test_a_merged_map_passes_verification(seed, turn):
     loaded, partial = synthetic(seed, shared=True), synthetic(seed + 1, session=2, shared=True)
     merged, _ = loaded.merge(partial, Match(1, 2, turn))
     with tempfile.TemporaryDirectory() as folder:
@@ -710,7 +711,7 @@ def test_a_brain_merged_with_itself_is_that_brain(seed, panoramic):
     assert len(found.match.pairs.partial) == brain.map.n
     merged, report = brain.merge(brain, found.match)
     assert merged is not None, report.reason
-    assert "nothing is new" in report.reason
+    assert "no experience is new" in report.reason
     was, is_now = brain.state_dict(), merged.state_dict()
     for table in ("view.templates", "pose_cells.bindings", "map.experiences", "map.links_table"):
         for key in (key for key in was if key.startswith(table)):
@@ -744,7 +745,7 @@ def lived(frames, config=None):
     return brain
 
 
-def test_two_halves_of_a_life_that_overlap_are_that_life(ellipse):
+def test_two_overlapping_halves_of_a_drive_merge_into_the_map_of_the_drive(ellipse):
     whole = lived(ellipse)
     made = whole.map.experiences["first_frame"].numpy()
     cut = int(made[made >= 120][0])  # a new place, so that the second half begins as it goes on
@@ -761,7 +762,7 @@ def test_two_halves_of_a_life_that_overlap_are_that_life(ellipse):
     )
 
 
-def test_a_life_and_the_copy_that_went_on_are_the_life_that_went_on(ellipse):
+def test_a_map_and_its_continuation_merge_into_the_continuation(ellipse):
     copy, whole = lived(ellipse[:200]), lived(ellipse)
     for one, other in ((copy, whole), (whole, copy)):
         merged, _ = one.merge(other, find_match(one, other).match)
@@ -771,7 +772,7 @@ def test_a_life_and_the_copy_that_went_on_are_the_life_that_went_on(ellipse):
         assert [s.frames for s in merged.sessions.sessions] == [300]
 
 
-def test_copies_that_went_different_ways_are_told_apart(ellipse):
+def test_copies_that_were_continued_differently_are_refused(ellipse):
     config = BrainConfig(sessions={"kidnapped": "ignore"})
     brain = lived(ellipse[:100], config)
     state = {k: v.clone() for k, v in brain.state_dict().items()}
@@ -783,7 +784,7 @@ def test_copies_that_went_different_ways_are_told_apart(ellipse):
         other(frame._replace(index=100 + k, time_s=ellipse[100 + k].time_s))
     found = find_match(brain, other)
     assert found.match is None
-    assert "went another way" in found.reason
+    assert "continued differently" in found.reason
 
 
 # --- refusals -----------------------------------------------------------------------------------
@@ -797,7 +798,7 @@ def with_drift(brain, drift):
 
 @pytest.mark.parametrize("far", [0, 44])
 @pytest.mark.parametrize(
-    ("drift", "said"), [(0.25, "odometry may be off by"), (1.0, "contradicts itself")]
+    ("drift", "said"), [(0.25, "of odometry drift"), (1.0, "the merged map is inconsistent")]
 )
 def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(
     far, drift, said, ellipse
@@ -841,10 +842,10 @@ def test_maps_made_with_other_views_or_cells_are_refused_and_the_keys_named():
 @pytest.mark.parametrize(
     ("match", "which"),
     [
-        (Match(9, 0), "place 9 of the loaded map; it has 9"),
-        (Match(0, 9), "place 9 of the partial map; it has 9"),
-        (Match(-1, 0), "place -1 of the loaded map"),
-        (Match(0, 0, others=Pairs.of([(12, 1, 0.0, 0.0)])), "place 12 of the partial map"),
+        (Match(9, 0), "experience 9 of the loaded map; expected 0 to 8"),
+        (Match(0, 9), "experience 9 of the partial map; expected 0 to 8"),
+        (Match(-1, 0), "experience -1 of the loaded map"),
+        (Match(0, 0, others=Pairs.of([(12, 1, 0.0, 0.0)])), "experience 12 of the partial map"),
     ],
 )
 def test_a_match_that_names_a_missing_place_is_a_mistake_that_is_named(match, which):

@@ -72,7 +72,7 @@ def test_a_profile_is_the_mean_grey_of_the_columns(image, data):
     np.testing.assert_allclose(ours, (image[y_min:, x_min:] / 255.0).mean(axis=0), atol=1e-15)
 
 
-def test_a_picture_that_moves_right_means_a_turn_to_the_left():
+def test_an_image_that_moves_right_means_a_turn_to_the_left():
     odometry = VisualOdometry(OdometryConfig(fov_deg=90))
     odometry(panorama(), DT)
     left = odometry(np.roll(panorama(), 8, axis=1), DT)
@@ -91,7 +91,7 @@ def test_through_the_bends_of_a_rendered_world_it_turns_as_the_camera_does():
 
 
 @given(st.integers(0, 255), st.integers(0, 255))
-def test_a_flat_picture_that_grows_brighter_or_darker_is_no_turn(before, now):
+def test_a_flat_image_that_grows_brighter_or_darker_is_no_turn(before, now):
     odometry = VisualOdometry(OdometryConfig(max_shift_px=20))
     odometry(np.full((31, 47), before, np.uint8), DT)
     velocity = odometry(np.full((31, 47), now, np.uint8), DT)
@@ -106,7 +106,7 @@ def test_a_black_stream_is_exactly_no_motion(first_frame):
     assert [odometry(black, DT) for _ in range(5)] == [STILL] * 5
 
 
-def test_a_picture_seen_twice_is_exactly_no_motion():
+def test_an_image_seen_twice_is_exactly_no_motion():
     odometry = VisualOdometry(OdometryConfig())
     assert [odometry(panorama(), DT) for _ in range(3)] == [STILL] * 3
 
@@ -152,9 +152,9 @@ def test_it_resumes_bit_for_bit():
     expected = [whole(image, DT) for image in images]
     for cut in range(6):
         before, after = VisualOdometry(OdometryConfig()), VisualOdometry(OdometryConfig())
-        said = [before(image, DT) for image in images[:cut]]
+        motions = [before(image, DT) for image in images[:cut]]
         after.load_state_dict({k: v.clone() for k, v in before.state_dict().items()})
-        assert said + [after(image, DT) for image in images[cut:]] == expected
+        assert motions + [after(image, DT) for image in images[cut:]] == expected
 
 
 def test_the_state_is_replaced_and_not_written_over():
@@ -171,11 +171,11 @@ def test_the_state_is_replaced_and_not_written_over():
     "region",
     [(0, 161, 0, 60), (-1, 100, 0, 60), (0, 160, 60, 121), (80, 80, 0, 60), (0, 160, 9, 3)],
 )
-def test_a_region_outside_the_picture_is_refused_with_both_sizes(name, region):
+def test_a_region_outside_the_image_is_refused_with_both_sizes(name, region):
     odometry = VisualOdometry(OdometryConfig(**{name: region}))
     with pytest.raises(ConfigError) as caught:
         odometry(panorama(), DT)
-    assert f"odometry.{name} = {list(region)} does not lie in a picture of 160 x 120 px" in str(
+    assert f"odometry.{name} = {list(region)} does not lie in an image of 160 x 120 px" in str(
         caught.value
     )
 
@@ -186,14 +186,14 @@ def test_a_region_narrower_than_the_offsets_is_refused():
         odometry(panorama(width=32), DT)
 
 
-def test_a_picture_of_another_size_or_kind_is_a_bad_frame_that_changes_nothing():
+def test_an_image_of_another_size_or_kind_is_a_bad_frame_that_changes_nothing():
     odometry = VisualOdometry(OdometryConfig())
     odometry(panorama(), DT)
-    with pytest.raises(BadFrame, match="picture is 80 x 120 px; expected 160 x 120 px"):
+    with pytest.raises(BadFrame, match="image is 80 x 120 px; expected 160 x 120 px"):
         odometry(panorama(width=80), DT)
-    with pytest.raises(BadFrame, match="picture is float64"):
+    with pytest.raises(BadFrame, match="image is float64"):
         odometry(panorama() / 255.0, DT)
     for dt in (0.0, -DT, math.nan):
-        with pytest.raises(BadFrame, match="s since the last picture; expected more than 0"):
+        with pytest.raises(BadFrame, match="s since the last image; expected more than 0"):
             odometry(panorama(), dt)
     assert odometry(panorama(), DT) == STILL

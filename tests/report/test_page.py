@@ -87,17 +87,27 @@ def on_screen(page, place):
 
 
 def wait_until(page, true):
-    """Wait for at most five seconds. The page's policy forbids Playwright's own way to do so."""
-    for _ in range(100):
+    """Wait for at most a minute. The page's policy forbids Playwright's own way to do so."""
+    for _ in range(1200):
         if page.evaluate(true):
             return
         page.wait_for_timeout(50)
     raise AssertionError(f"not {true}")
 
 
+def let_it_draw(page, frames=3):
+    """Wait until the page has drawn so many frames of the screen, however long that takes."""
+    page.evaluate(
+        """async frames => {
+          for (let i = 0; i < frames; i++) await new Promise(requestAnimationFrame);
+        }""",
+        frames,
+    )
+
+
 def picture(page):
     """The pixels of the map, ``(h, w, 4)``."""
-    page.wait_for_timeout(60)  # a frame or two of the screen
+    let_it_draw(page)
     file = page.evaluate("document.getElementById('map').toDataURL()").partition(",")[2]
     data = np.frombuffer(base64.b64decode(file), np.uint8)
     return cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(np.int16)
@@ -162,10 +172,18 @@ def test_playing_goes_on_by_itself_and_stops_at_the_end(page):
     page.locator("#slider").fill("0")
     page.locator("#speed").select_option("20")
     page.locator("#play").click()
-    wait_until(page, "chosen.row > 20")
-    page.locator("#play").click()
-    row = page.evaluate("chosen.row")
-    page.wait_for_timeout(80)
+    row = page.evaluate(  # in the page: seen from here, a slow machine may be at the end already
+        """() => new Promise(pressed => {
+          const look = () => {
+            if (chosen.row <= 20) return requestAnimationFrame(look);
+            document.getElementById("play").click();
+            pressed(chosen.row);
+          };
+          look();
+        })"""
+    )
+    assert row < page.evaluate("known.rows - 1")
+    let_it_draw(page, 5)
     assert page.evaluate("chosen.row") == row
     page.keyboard.press("Escape")
     page.locator("#speed").select_option("500")
@@ -287,7 +305,12 @@ def test_it_follows_the_light_or_dark_of_the_system_and_can_be_switched(show, ru
 def test_nothing_is_wider_than_the_window(width, show, runs):
     page = show(runs / "second" / "report.html")
     page.set_viewport_size({"width": width, "height": 800})
-    page.wait_for_timeout(80)
+    wait_until(
+        page,
+        f"innerWidth === {width}"
+        " && map.width === map.canvas.parentElement.getBoundingClientRect().width",
+    )
+    let_it_draw(page)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert page.locator("#map").bounding_box()["height"] > 300
 
@@ -354,3 +377,25 @@ def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):
     place = page.evaluate("map.nearest(400, 300, 1e9)")
     page.mouse.click(*on_screen(page, place))
     assert page.evaluate("chosen.place") == place
+
+
+def test_populations_show_their_counts_and_their_pictures_as_they_are(show, tmp_path):
+    config = BrainConfig(cells="pose+head_direction+speed")
+    run(WORLD, tmp_path / "run", config, stop=30, tensorboard=False)
+    write_report(tmp_path / "run")
+    page = show(tmp_path / "run" / "report.html")
+    cards = page.locator("#population-list .card")
+    assert cards.locator("h3").all_inner_texts() == ["head direction", "speed"]
+    assert cards.nth(1).locator("dd").first.inner_text() == "32"
+    images = page.locator("#population-list img")
+    sizes = images.evaluate_all("all => all.map(i => [i.naturalWidth, i.naturalHeight, i.width])")
+    assert sizes == [[65, 65, 260], [32, 1, 256]]
+    assert set(images.evaluate_all("all => all.map(i => getComputedStyle(i).imageRendering)")) == {
+        "pixelated"
+    }
+    assert page.locator("#to-populations").is_visible()
+
+
+def test_where_the_page_draws_all_populations_itself_there_is_no_such_section(page):
+    assert not page.locator("#populations").is_visible()
+    assert not page.locator("#to-populations").is_visible()

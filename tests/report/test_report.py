@@ -342,7 +342,12 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
     assert not nowhere[40:].any()
     assert (page.arrays["row_place"] == -1).tolist() == nowhere.tolist()
     (left,) = page.about["not_joined"]
-    assert "looked like one of it" in left["reason"]
+    assert "matched by view" in left["reason"]
+    began = [session["began"] for session in page.about["sessions"]]
+    assert "kidnapped" in began
+    written = (Path(collect.__file__).parent / "tables.js").read_text()
+    words = re.search(r"const BEGAN = \{(.*?)\};", written)[1]
+    assert {*began, "start", "gap"} <= set(re.findall(r"(\w+):", words))
 
 
 def test_when_an_animal_was_lost_follows_from_its_doubt():
@@ -420,7 +425,7 @@ def damaged(runs, tmp_path, name, change):
     [
         ("metrics.json", lambda p: p.unlink(), "metrics.json: missing"),
         ("metrics.json", lambda p: p.write_text("{}"), "metrics.json: damaged"),
-        ("config.toml", lambda p: p.unlink(), "config.toml: is missing"),
+        ("config.toml", lambda p: p.unlink(), "config.toml: missing"),
         ("frames.csv", lambda p: p.unlink(), "frames.csv: missing"),
         ("frames.csv", lambda p: p.write_text("frame\n0\n"), "frames.csv: damaged"),
         ("frames.csv", lambda p: p.write_bytes(b"\xff\xfe\n\xff"), "frames.csv: damaged"),

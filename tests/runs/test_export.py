@@ -87,7 +87,7 @@ def residuals(vertices, edges):
     return np.hypot(apart[:, 0], apart[:, 1]), np.abs(wrap_angles(apart[:, 2]))
 
 
-def test_edges_of_a_chain_lead_exactly_from_place_to_place(chain, tmp_path):
+def test_edges_of_a_chain_are_the_displacements_between_experiences(chain, tmp_path):
     vertices, edges, fixed = read_g2o(export(chain, tmp_path / "map.g2o"))
     metres, radians = residuals(vertices, edges)
     assert metres.max() < 1e-12
@@ -192,11 +192,15 @@ def test_a_map_of_one_place_has_no_edges(tmp_path):
         (
             "map.svg",
             None,
-            "map.svg: no such kind of export, 'svg'; expected tum, g2o, graphml or nir",
+            "map.svg: unknown export format 'svg'; expected tum, g2o, graphml or nir",
         ),
-        ("map", None, "map: no such kind of export, ''; expected tum, g2o, graphml or nir"),
-        ("map.g2o", "dot", "no such kind of export, 'dot'; expected tum, g2o, graphml or nir"),
-        ("brain.safetensors", "g2o", "brain.safetensors: is the brain itself; take another file"),
+        ("map", None, "map: unknown export format ''; expected tum, g2o, graphml or nir"),
+        ("map.g2o", "dot", "unknown export format 'dot'; expected tum, g2o, graphml or nir"),
+        (
+            "brain.safetensors",
+            "g2o",
+            "brain.safetensors: is the brain file to export; choose another output file",
+        ),
         ("", "g2o", "cannot be written (Is a directory)"),
     ],
 )
@@ -210,7 +214,7 @@ def test_what_cannot_be_exported_is_refused_in_a_line(to, kind, says, chain, tmp
     assert file.read_bytes() == chain.read_bytes()
 
 
-def test_nothing_is_exported_of_nothing(folder, tmp_path):
+def test_an_empty_map_or_a_damaged_run_is_not_exported(folder, tmp_path):
     with pytest.raises(CheckpointError, match="no such brain file"):
         export(tmp_path / "none", tmp_path / "map.g2o")
     with pytest.raises(RunError, match="its map is empty"):
@@ -222,12 +226,12 @@ def test_nothing_is_exported_of_nothing(folder, tmp_path):
     assert not (tmp_path / "track.tum").exists()
 
 
-def test_the_spiking_neurons_of_a_brain_are_exported_and_others_told_so(chain, tmp_path):
+def test_spiking_neurons_are_exported_and_a_brain_without_them_is_refused(chain, tmp_path):
     nir = pytest.importorskip("nir", reason="NIR is an extra")
     spiking = {"tier": "spiking", "time_step_s": 0.001, "space": {"n_rotations": 1, "n_scales": 1}}
     brain = NavigationBrain(BrainConfig(cells="pose+semantic", semantic=spiking))
     save_brain(brain, tmp_path / "spiking.safetensors")
     graph = nir.read(export(tmp_path / "spiking.safetensors", tmp_path / "walk.nir"))
     assert len(graph.nodes) == 8 * brain.semantic.slam.space.n_frequencies
-    with pytest.raises(ConfigError, match="has no spiking neurons; run it with semantic cells"):
+    with pytest.raises(ConfigError, match="has no spiking neurons; run with semantic cells"):
         export(chain, tmp_path / "none.nir")

@@ -64,8 +64,7 @@ def test_a_run_never_writes_over_its_own_source(copy, tmp_path, says):
         code, _, err = says("run", source, "-o", out, "--overwrite")
         assert code == 2
         assert err == (
-            f"neuroslam run: {out}: is where the source is, which would change; "
-            "take another folder\n"
+            f"neuroslam run: {out}: a run here would overwrite its source; choose another folder\n"
         )
         assert contents(tmp_path) == before
 
@@ -91,11 +90,11 @@ def test_the_demo_replaces_no_run_but_a_demo(copy, says):
     before = contents(copy)
     code, _, err = says("demo", "-o", copy)
     assert code == 2
-    assert err == f"neuroslam demo: {copy}: holds a run of something else; take another folder\n"
+    assert err == f"neuroslam demo: {copy}: holds a run of another source; choose another folder\n"
     assert contents(copy) == before
 
 
-def test_a_demo_that_is_interrupted_tells_no_figures(tmp_path, says, monkeypatch):
+def test_an_interrupted_demo_prints_no_figures(tmp_path, says, monkeypatch):
     out, step = tmp_path / "demo", TensorBoardRecorder.step
 
     def press(recorder, result, *rest):
@@ -109,10 +108,10 @@ def test_a_demo_that_is_interrupted_tells_no_figures(tmp_path, says, monkeypatch
     assert len(read_frames(out / "first")["frame"]) == 6
 
 
-def test_a_run_at_its_end_says_that_nothing_was_left_to_do(copy, says):
+def test_resuming_a_finished_run_says_that_there_is_nothing_to_do(copy, says):
     code, out, _ = says("resume", copy, "--stop", 30, QUICK)
     assert (code, out.splitlines()[0]) == (
-        0, "Nothing was left to do: the run had come to its end already",
+        0, "Nothing to do: the run has reached its end",
     )  # fmt: skip
     assert "Nothing" not in says("resume", copy, "--stop", 31, QUICK)[1]
 
@@ -122,8 +121,8 @@ def test_a_lost_config_does_not_cost_the_map(copy, says):
     code, _, err = says("resume", copy)
     assert (code, "overwrite" in err) == (2, False)
     assert err == (
-        f"neuroslam resume: {copy}/config.toml: is missing, and says what the run reads; put it "
-        f"back. The map is in {copy}/brain.safetensors, which can be used alone\n"
+        f"neuroslam resume: {copy}/config.toml: missing; it holds the source of the run. Restore "
+        f"it, or use {copy}/brain.safetensors alone\n"
     )
 
 
@@ -145,7 +144,10 @@ def test_a_run_is_not_resumed_backwards(copy, says):
     before = contents(copy)
     code, _, err = says("resume", copy, "--stop", 29)
     assert code == 2
-    assert err == f"neuroslam resume: {copy}: is at frame 30 already; --stop 29 is behind that\n"
+    assert (
+        err
+        == f"neuroslam resume: {copy}: is at frame 30; expected --stop of at least that, got 29\n"
+    )
     assert contents(copy) == before
     assert says("resume", copy, "--stop", 30, QUICK)[0] == 0
 
@@ -188,7 +190,7 @@ def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_file
     for command in ("plot", "inspect", "report"):  # what was saved can be looked at
         assert says(command, out)[0] == 0
     (out / ".brain.safetensors.abcd1234.tmp").write_bytes(b"half")  # killed while it saved
-    said = f"{out}: was cut off before its end; go on with: neuroslam resume {out}\n"
+    said = f"{out}: the run was cut off; continue it with: neuroslam resume {out}\n"
     for command in (("evaluate", out), ("export", out, tmp_path / "a.tum")):
         assert says(*command) == (2, "", f"neuroslam {command[0]}: {said}")
     assert says("resume", out, "--stop", stop, QUICK, "--save-every", "0")[0] == 0
@@ -202,7 +204,7 @@ def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_file
 def test_a_run_that_was_killed_in_its_first_save_says_so(copy, says):
     for name in RUN_FILES[4:]:
         (copy / name).unlink()
-    said = f"{copy}: was cut off before anything was saved; run it again with --overwrite\n"
+    said = f"{copy}: the run was cut off before its first save; run again with --overwrite\n"
     assert says("resume", copy) == (2, "", f"neuroslam resume: {said}")
 
 
@@ -213,8 +215,8 @@ def test_a_run_that_was_killed_before_it_saved_says_so(tmp_path, says):
         code, _, err = says(command, out)
         assert code == 2
         assert err == (
-            f"neuroslam {command}: {out}: was cut off before anything was saved; "
-            "run it again with --overwrite\n"
+            f"neuroslam {command}: {out}: the run was cut off before its first save; "
+            "run again with --overwrite\n"
         )
     assert says("run", WORLD, "-o", out, "--stop", 2, QUICK, "--overwrite")[0] == 0
 
@@ -261,10 +263,10 @@ def test_a_single_frame_and_a_truth_of_another_time_cannot_be_compared(copy, tmp
     assert len(read_trace(out)["time_s"]) == 1
     code, _, err = says("evaluate", out)
     assert (code, err.count("\n")) == (2, 1)
-    assert f"{out}: 1 of its frames have a true pose of their time; expected two" in err
+    assert f"{out}: a true pose within 0.02 s for 1 of 1 frame; expected at least 2 frames\n" in err
     (tmp_path / "far.tum").write_text("9000 0 0 0 0 0 0 1\n9001 1 0 0 0 0 0 1\n")
     code, _, err = says("evaluate", copy, "--truth", tmp_path / "far.tum")
-    assert (code, ": 0 of its frames have a true pose" in err) == (2, True)
+    assert (code, "0.02 s for 0 of 30 frames; expected at least 2 frames; is " in err) == (2, True)
 
 
 def test_a_speed_beyond_any_robots_is_a_bad_line(tmp_path, says):
@@ -287,7 +289,7 @@ def test_a_name_that_cannot_be_written_into_config_toml_is_refused(tmp_path, say
 @pytest.mark.parametrize(
     ("options", "end"), [({"stop": 3}, 3), ({"start": 99, "stop": 5000}, 101)], ids=["stop", "end"]
 )
-def test_the_end_is_announced_for_who_shows_progress(options, end, tmp_path):
+def test_the_frame_to_stop_before_is_announced(options, end, tmp_path):
     seen = []
     world = WORLD.replace("laps=300", f"laps={100 / 60}")
     run(

@@ -49,7 +49,7 @@ def test_neighbours_are_paired_first_and_each_once():
     assert list(_pairs(parts, every)) == []
 
 
-def test_who_is_refused_is_tried_with_another_of_the_level(done):
+def test_a_refused_map_is_tried_with_another_of_the_level(done):
     _, report = done
     first = [row for row in report.tree if row["level"] == 1]
     tried = [(row["first"], row["second"], row["merged"]) for row in first]
@@ -59,7 +59,7 @@ def test_who_is_refused_is_tried_with_another_of_the_level(done):
     assert all(row["reason"] and len(row["reports"]) >= 1 for row in report.tree)
 
 
-def test_all_that_meet_become_one_map_and_the_others_say_why_not(done):
+def test_matching_maps_become_one_and_the_others_have_a_reason(done):
     out, report = done
     assert report.merged["sessions"] == [1, 2, 3, 4]
     (apart,) = report.apart
@@ -90,7 +90,8 @@ def test_the_merged_map_lies_where_the_ring_is(done):
     assert "ate_merged_m" not in report.sessions[4]
 
 
-def test_two_at_once_give_the_maps_of_one_after_the_other(done, tmp_path):
+@pytest.mark.usefixtures("forked")
+def test_two_jobs_give_the_maps_of_one_job(done, tmp_path):
     out, report = done
     told = []
     two = fleet(
@@ -108,7 +109,7 @@ def test_two_at_once_give_the_maps_of_one_after_the_other(done, tmp_path):
     assert {what for what, _, _ in told[5:]} == {f"merges, level {k}" for k in (1, 2, 3)}
 
 
-def test_the_legend_names_every_source_and_says_which_brought_no_place():
+def test_the_legend_names_every_source_and_marks_those_without_an_experience():
     sources = ("a/monday.mp4", "b/c/tuesday.mp4", "world:ellipse?look=$1", "gone.mp4")
     report = FleetReport(
         [
@@ -118,7 +119,7 @@ def test_the_legend_names_every_source_and_says_which_brought_no_place():
     )
     assert _names(report, {1, 3}) == [
         "1: a/monday.mp4",
-        "2: c/tuesday.mp4, no place of its own",
+        "2: c/tuesday.mp4, no experience of its own",
         r"3: world:ellipse?look=\$1",
         "4: gone.mp4, failed",
     ]
@@ -145,7 +146,7 @@ def test_a_fleet_on_one_map_is_exit_0_and_one_that_is_not_3(tmp_path, call):
     assert not (tmp_path / "one" / "merged").exists()
 
 
-def test_a_session_that_fails_is_told_in_one_line_and_stops_no_other(tmp_path, call):
+def test_a_failed_session_is_reported_in_one_line_and_stops_no_other(tmp_path, call):
     out = tmp_path / "out"
     given = [f"{source}&frames_per_lap=200" for source in (SOURCES[0], SOURCES[2])]
     done = call("fleet", given[0], tmp_path / "nowhere.avi", given[1], "-o", out,

@@ -88,7 +88,7 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
     out = tmp_path / "deep" / "out"
     done = call("merge", runs / "a", runs / "b", "-o", out)
     assert (done.code, done.err) == (0, "")
-    assert re.search(r"^merged: \d+ places are new$", done.out, re.MULTILINE)
+    assert re.search(r"^merged: \d+ experiences are new$", done.out, re.MULTILINE)
     assert done.out.endswith(f"Written: {out}\n")
     assert {path.name for path in out.iterdir()} == set(RUN_FILES)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
@@ -121,7 +121,7 @@ def test_the_map_says_how_many_frames_are_on_maps_that_were_not_joined(runs):
     assert all_here == "way/drive.mp4: 28 frames\n1 stored map was not joined"
 
 
-def test_all_files_of_a_merge_tell_the_same(runs, merged):
+def test_all_files_of_a_merge_agree(runs, merged):
     brain, a, b = (load_brain(f / "brain.safetensors") for f in (merged, runs / "a", runs / "b"))
     metrics = json.loads((merged / "metrics.json").read_text())
     assert (metrics["templates"], metrics["experiences"], metrics["links"]) == sizes(brain)
@@ -200,7 +200,7 @@ def test_brain_files_merge_too_without_frames(runs, tmp_path, call):
     ).read_bytes()
 
 
-def test_what_needs_frames_says_that_a_merge_of_brain_files_has_none(runs, tmp_path, call, mistake):
+def test_commands_that_need_frames_refuse_a_merge_of_brain_files(runs, tmp_path, call, mistake):
     files = [runs / name / "brain.safetensors" for name in ("a", "b")]
     out = tmp_path / "out"
     assert call("merge", *files, "-o", out).code == 0
@@ -302,7 +302,7 @@ def test_a_map_cannot_be_overwritten_by_its_own_merge(which, overwrite, runs, mi
     assert contents(runs) == before
 
 
-def test_a_folder_that_holds_a_run_is_kept_unless_told_otherwise(runs, merged, tmp_path, mistake):
+def test_a_folder_that_holds_a_run_is_kept_without_overwrite(runs, merged, tmp_path, mistake):
     out = shutil.copytree(merged, tmp_path / "out")
     before = contents(out)
     assert "--overwrite" in mistake("merge", runs / "b", runs / "a", "-o", out)

@@ -219,9 +219,9 @@ def test_ctrl_c_saves_and_the_run_goes_on_as_if_it_had_not_been(tmp_path):
                 process.send_signal(signal.SIGINT)
                 break
             time.sleep(0.01)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert said.decode() == (f"neuroslam run: interrupted; go on with: neuroslam resume {out}\n")
+    assert said.decode() == (f"neuroslam run: interrupted; continue with: neuroslam resume {out}\n")
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["interrupted"]
     frames = metrics["frames"]
@@ -327,7 +327,7 @@ def test_a_source_outside_the_folder_is_found_from_anywhere(pictures, tmp_path, 
     assert summary.frames == 12
 
 
-def test_a_preset_gives_way_to_a_file_and_the_file_to_single_values(tmp_path):
+def test_a_file_overrides_a_preset_and_assignments_override_both(tmp_path):
     preset = read_preset("openratslam")
     assert {"threshold", "shift_match"} <= preset["view"].keys()
     file = tmp_path / "mine.toml"
@@ -388,7 +388,7 @@ def test_overwriting_leaves_nothing_of_the_run_before(whole, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["frames.csv", "trace.f64"])
-def test_rows_that_are_missing_are_told_before_anything_is_written(cut_copy, name):
+def test_missing_rows_are_reported_before_anything_is_written(cut_copy, name):
     content = (cut_copy / name).read_bytes()
     (cut_copy / name).write_bytes(content[: len(content) // 2])
     with pytest.raises(RunError, match=rf"{re.escape(name)}: .*cannot resume"):

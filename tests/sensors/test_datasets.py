@@ -1,4 +1,4 @@
-"""Folders of known datasets, bags and cameras give the pictures, times, motion and truth."""
+"""Folders of known datasets, bags and cameras give the images, times, motion and truth."""
 
 import itertools
 import math
@@ -53,11 +53,11 @@ def require(source, truth=True):
 
 
 def tum(folder):
-    lines, poses = ["# time picture"], ["# time tx ty tz qx qy qz qw"]
+    lines, poses = ["# time image"], ["# time tx ty tz qx qy qz qw"]
     for k in range(N):
         write(folder / "rgb" / f"{TIMES[k]:.6f}.png", GREYS[k])
         lines.append(f"{TIMES[k]:.6f} rgb/{TIMES[k]:.6f}.png")
-    for time_s in np.arange(EPOCH_S - 0.05, TIMES[-1] + 0.1, 0.05):  # more often than pictures
+    for time_s in np.arange(EPOCH_S - 0.05, TIMES[-1] + 0.1, 0.05):  # more often than images
         k = (time_s - EPOCH_S) / 0.1
         turned = quaternions(camera_looking(np.interp(k, np.arange(N), HEADINGS)))
         place = [np.interp(k, np.arange(N), XY[:, 0]), np.interp(k, np.arange(N), XY[:, 1]), 1.3]
@@ -80,32 +80,32 @@ def kitti(folder):
 
 
 def euroc(folder):
-    cam, told = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
-    told.mkdir(parents=True)
+    cam, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir(parents=True)
     body_from_camera = camera_looking(0.0)  # the camera looks along the body's x
-    pictures, poses = (
+    images, poses = (
         ["#timestamp [ns],filename"],
         ["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z"],
     )
     for k in range(N):
         stamp = round(TIMES[k] * 1e9)
         write(cam / "data" / f"{stamp}.png", GREYS[k])
-        pictures.append(f"{stamp},{stamp}.png")
+        images.append(f"{stamp},{stamp}.png")
         x, y, z, w = quaternions(camera_looking(HEADINGS[k]) @ body_from_camera.T)
         poses.append(f"{stamp},{XY[k, 0]},{XY[k, 1]},0.8,{w},{x},{y},{z},0,0,0")
     matrix = np.eye(4)
     matrix[:3, :3] = body_from_camera
     numbers = ", ".join(map(str, matrix.ravel()))
-    (cam / "data.csv").write_text("\n".join(pictures))
+    (cam / "data.csv").write_text("\n".join(images))
     (cam / "sensor.yaml").write_text(
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers}]\nrate: 20\n"
     )
-    (told / "data.csv").write_text("\n".join(poses))
+    (truth / "data.csv").write_text("\n".join(poses))
     return folder
 
 
 @pytest.mark.parametrize("make", [tum, kitti, euroc])
-def test_a_dataset_gives_its_pictures_times_and_truth(make, tmp_path):
+def test_a_dataset_gives_its_images_times_and_truth(make, tmp_path):
     require(open_source(make(tmp_path / "data")))
 
 
@@ -153,21 +153,21 @@ def test_real_kitti_poses_lie_on_the_ground(shared, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "damage", "said"),
+    ("make", "damage", "message"),
     [
         (tum, lambda d: (d / "groundtruth.txt").write_text("1 2 3"), "expected 8 numbers"),
-        (tum, lambda d: (d / "rgb.txt").write_text("# nothing"), "names no pictures"),
+        (tum, lambda d: (d / "rgb.txt").write_text("# nothing"), "lists no images"),
         (kitti, lambda d: (d / "poses.txt").write_text("1 2 3"), "expected 12 numbers"),
-        (kitti, lambda d: (d / "times.txt").write_text("0.0"), "1 times for 12 pictures"),
-        (kitti, lambda d: [f.unlink() for f in (d / "image_0").iterdir()], "holds no pictures"),
+        (kitti, lambda d: (d / "times.txt").write_text("0.0"), "1 times for 12 images"),
+        (kitti, lambda d: [f.unlink() for f in (d / "image_0").iterdir()], "contains no images"),
         (euroc, lambda d: (d / "mav0/cam0/data.csv").write_text("a,b"), "time in ns"),
         (euroc, lambda d: (d / "mav0/cam0/sensor.yaml").write_text("T_BS: 3"), "no T_BS"),
     ],
 )
-def test_a_damaged_dataset_is_one_line(make, damage, said, tmp_path):
+def test_a_damaged_dataset_is_one_line(make, damage, message, tmp_path):
     folder = make(tmp_path / "data")
     damage(folder)
-    with pytest.raises(SourceError, match=said) as caught:
+    with pytest.raises(SourceError, match=message) as caught:
         open_source(folder)
     assert "\n" not in str(caught.value)
 
@@ -245,11 +245,11 @@ def bag(request, tmp_path):
     return path
 
 
-def test_a_bag_gives_pictures_motion_and_ranges_merged_by_time(bag):
+def test_a_bag_gives_images_motion_and_ranges_merged_by_time(bag):
     frames = list(open_source(bag))
-    pictures = [frame for frame in frames if frame.image is not None]
-    assert [int(frame.image.mean()) for frame in pictures] == [10 * k for k in range(len(pictures))]
-    assert len(pictures) >= N - 1
+    images = [frame for frame in frames if frame.image is not None]
+    assert [int(frame.image.mean()) for frame in images] == [10 * k for k in range(len(images))]
+    assert len(images) >= N - 1
     times = np.array([frame.time_s for frame in frames])
     driven = sum(f.velocity.v_m_s * dt for f, dt in zip(frames[1:], np.diff(times), strict=True))
     assert driven == pytest.approx(2.0 * (times[-1] - times[0]))
@@ -263,7 +263,9 @@ def test_a_bag_gives_pictures_motion_and_ranges_merged_by_time(bag):
 def test_a_topic_may_be_chosen_and_an_unknown_one_is_one_line(bag):
     packed = [f for f in open_source(f"{bag}?image=/packed") if f.image is not None]
     assert packed[0].time_s == pytest.approx(TIMES[0])
-    with pytest.raises(SourceError, match="'/none' is not in it; for image there are /front, /pac"):
+    with pytest.raises(
+        SourceError, match="'/none' is not in the bag; topics for image: /front, /pac"
+    ):
         open_source(f"{bag}?image=/none")
     with pytest.raises(SourceError, match="unknown option 'picture'"):
         open_source(f"{bag}?picture=/front")
@@ -289,7 +291,7 @@ def test_the_file_alone_gives_what_its_folder_gives(bag):
 def test_a_broken_bag_is_one_line(bag):
     damaged = storage(bag)
     damaged.write_bytes(damaged.read_bytes()[:100])
-    with pytest.raises(SourceError, match="is not a whole ROS bag") as caught:
+    with pytest.raises(SourceError, match="is damaged or incomplete") as caught:
         open_source(bag)
     assert "\n" not in str(caught.value)
 
@@ -306,12 +308,12 @@ def test_rays_go_to_the_bearing_they_have():
 
 
 class FakeDevice:
-    """Stands in for OpenCV's capture: some pictures, then none."""
+    """Stands in for OpenCV's capture: some images, then none."""
 
     opened = True
 
     def __init__(self, device):
-        self.pictures = iter(GREYS[:5])
+        self.images = iter(GREYS[:5])
         self.device = device
 
     def isOpened(self):  # noqa: N802
@@ -321,14 +323,14 @@ class FakeDevice:
         return 30.0
 
     def read(self):
-        image = next(self.pictures, None)
+        image = next(self.images, None)
         return image is not None, None if image is None else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
     def release(self):
         pass
 
 
-def test_a_camera_gives_pictures_at_the_times_they_come(monkeypatch):
+def test_a_camera_gives_images_at_the_times_they_come(monkeypatch):
     monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
     source = open_source("camera:0")
     assert (source.name, source.n_frames, source.frame_rate_hz) == ("camera:0", None, 30.0)
@@ -341,20 +343,20 @@ def test_a_camera_gives_pictures_at_the_times_they_come(monkeypatch):
     assert absolute_spec("camera:0") == "camera:0"
 
 
-def test_what_a_camera_showed_is_not_looked_for_later(monkeypatch, tmp_path):
+def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_path):
     monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
     small = ["--set", "view.template_width=16", "--set", "odometry.max_shift_px=8"]
     out = tmp_path / "out"
     assert main(["run", "camera:0", "-o", str(out), "--stop", "5", "--no-tensorboard", *small]) == 0
     page = write_report(out).read_text()
-    assert "a live camera shows something else by now" in page
+    assert "a live source cannot be read again" in page
     with pytest.raises(RunError, match="camera:0: is live; tuning looks several times"):
         tune("camera:0", tmp_path / "tuned")
 
 
 def test_a_camera_that_stops_or_is_not_there_is_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(camera.cv2, "VideoCapture", FakeDevice)
-    with pytest.raises(SourceError, match="gives no pictures any more, after 5"):
+    with pytest.raises(SourceError, match="delivers no more images after 5"):
         list(open_source("camera:0"))
     monkeypatch.setattr(FakeDevice, "opened", False)
     assert main(["run", "camera:3", "-o", str(tmp_path / "out")]) == 2

@@ -142,9 +142,9 @@ def test_the_scan_given_is_left_as_it_was():
 
 
 @pytest.mark.parametrize(
-    ("scan", "options", "says"),
+    ("scan", "options", "message"),
     [
-        (np.ones((2, 90)), {}, "shape (2, 90); expected (n,), at least 8 beams"),
+        (np.ones((2, 90)), {}, "shape (2, 90); expected (n,): metres, at least 8 beams"),
         (np.ones(7), {}, "shape (7,); expected (n,), at least 8 beams"),
         (np.array([1.0] * 9 + [np.nan]), {}, "beam 9 measures nan m; expected"),
         (np.array([1.0, -0.5] + [1.0] * 8), {}, "beam 1 measures -0.5 m; expected"),
@@ -152,8 +152,8 @@ def test_the_scan_given_is_left_as_it_was():
         (np.ones(8), {"tolerance_m": -1.0}, "tolerance_m is -1.0"),
     ],
 )
-def test_a_scan_that_cannot_be_used_is_a_bad_frame(scan, options, says):
+def test_a_scan_that_cannot_be_used_is_a_bad_frame(scan, options, message):
     with pytest.raises(BadFrame) as error:
         walls_in_scan(scan, **{"reach_m": REACH_M} | options)
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)

@@ -24,17 +24,17 @@ from neuroslam.types import Frame, Pose, Velocity
 W, H = 32, 24
 
 
-def picture(seed: int, width: int = W, height: int = H) -> np.ndarray:
+def random_image(seed: int, width: int = W, height: int = H) -> np.ndarray:
     coarse = np.random.default_rng(seed).integers(0, 256, (4, 5, 3), dtype=np.uint8)
     return cv2.resize(coarse, (width, height))
 
 
 def encoded(seed: int, suffix: str = ".png", **size: int) -> bytes:
-    return cv2.imencode(suffix, picture(seed, **size))[1].tobytes()
+    return cv2.imencode(suffix, random_image(seed, **size))[1].tobytes()
 
 
 def grey(seed: int) -> np.ndarray:
-    return cv2.cvtColor(picture(seed), cv2.COLOR_BGR2GRAY)
+    return cv2.cvtColor(random_image(seed), cv2.COLOR_BGR2GRAY)
 
 
 def fill(folder: Path, n: int, suffix: str = ".png") -> Path:
@@ -56,7 +56,7 @@ def pack(tar: Path, files: dict[str, bytes], mode: str = "w") -> Path:
 def film(path: Path, n: int, code: str = "MJPG", fps: float = 12.5) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), fps, (64, 48))
     for i in range(n):
-        writer.write(picture(i, 64, 48))
+        writer.write(random_image(i, 64, 48))
     writer.release()
     return path
 
@@ -75,10 +75,10 @@ def refused(spec: object, **options: float) -> str:
     return str(caught.value)
 
 
-# Pictures
+# Images
 
 
-def test_pictures_come_in_the_natural_order_of_their_names(tmp_path):
+def test_images_come_in_the_natural_order_of_their_names(tmp_path):
     frames = list(open_source(fill(tmp_path / "f", 11), frame_rate_hz=4.0))
     assert [f.index for f in frames] == list(range(11))
     assert [f.time_s for f in frames] == [i / 4.0 for i in range(11)]
@@ -129,7 +129,7 @@ def test_a_folder_may_hold_the_motion_of_its_frames(tmp_path):
     assert np.array_equal(second.image, grey(1))
 
 
-def test_a_list_names_pictures_and_times(tmp_path):
+def test_a_list_names_images_and_times(tmp_path):
     fill(tmp_path / "f g", 3)
     (tmp_path / "list.csv").write_text("time,path\n0.5,f g/2.png\n0.75,f g/0.png\n")
     (tmp_path / "list.txt").write_text("# time last\nf g/2.png 0.5\n\nf g/0.png 0.75\n")
@@ -154,18 +154,18 @@ def test_grey_is_made_from_colour_as_a_jpeg_decoded_to_grey_differs():
     assert np.array_equal(decode_grey(data), cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY))
 
 
-# What goes wrong with pictures
+# What goes wrong with images
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif", ".webp"])
 @pytest.mark.parametrize("fault", ["cut", "text", "empty"])
-def test_a_corrupt_picture_is_named_and_may_be_left_out(tmp_path, capfd, suffix, fault):
+def test_a_corrupt_image_is_named_and_may_be_left_out(tmp_path, capfd, suffix, fault):
     folder = fill(tmp_path / "f", 4, suffix)
     data = (folder / f"2{suffix}").read_bytes()
-    damaged = {"cut": data[: len(data) * 3 // 5], "text": b"not a picture" * 9, "empty": b""}
+    damaged = {"cut": data[: len(data) * 3 // 5], "text": b"not an image" * 9, "empty": b""}
     (folder / f"2{suffix}").write_bytes(damaged[fault])
     source, delivered = open_source(folder), []
-    with pytest.raises(BadFrame, match=rf"frame 2: 2\{suffix} is corrupt or not a picture"):
+    with pytest.raises(BadFrame, match=rf"frame 2: 2\{suffix} is corrupt or not an image"):
         delivered.extend(source)
     faults = []
     rest = source.frames(on_bad_frame=faults.append)
@@ -183,30 +183,30 @@ def test_a_damaged_png_is_refused_without_a_word_of_the_decoder(tmp_path, capfd)
     assert capfd.readouterr().err == ""
 
 
-def test_a_change_of_size_is_told_with_both_sizes_wherever_one_starts(tmp_path):
+def test_a_change_of_size_is_reported_with_both_sizes_wherever_one_starts(tmp_path):
     folder = fill(tmp_path / "f", 4)
     (folder / "2.png").write_bytes(encoded(2, width=40, height=30))
-    said = refused(folder)
-    assert "frame 2 (2.png) is 40 x 30 px; expected 32 x 24 px" in said
+    message = refused(folder)
+    assert "frame 2 (2.png) is 40 x 30 px; expected 32 x 24 px" in message
     with pytest.raises(BadFrame, match="frame 2"):
         list(open_source(folder).frames(start=2))
     assert [f.index for f in open_source(folder).frames(1, 4, [].append)] == [1, 3]
 
 
-def test_a_folder_without_pictures_or_with_none_that_decode_is_refused(tmp_path):
+def test_a_folder_without_images_or_with_none_that_decode_is_refused(tmp_path):
     (tmp_path / "notes.md").write_text("nothing")
-    assert "holds no pictures" in refused(tmp_path)
+    assert "contains no images" in refused(tmp_path)
     (tmp_path / "a.jpg").write_text("nothing")
-    fault = "frame 0: a.jpg is corrupt or not a picture"
+    fault = "frame 0: a.jpg is corrupt or not an image"
     assert refused(tmp_path).endswith(fault)
     (tmp_path / "b.jpg").write_text("nothing")
     assert refused(tmp_path).endswith(f"{fault}; and so are all 2 frames")
 
 
-def test_times_and_motion_must_be_as_many_as_pictures(tmp_path):
+def test_times_and_motion_must_be_as_many_as_images(tmp_path):
     folder = fill(tmp_path / "f", 3)
     (folder / "times.csv").write_text("time_s\n0\n1\n")
-    assert "2 times for 3 pictures; expected one each" in refused(folder)
+    assert "2 times for 3 images; expected one per image" in refused(folder)
     (folder / "times.csv").write_text("0\n1\nsoon\n")
     assert "times.csv: line 3 is 'soon'; expected a time in seconds" in refused(folder)
     (folder / "times.csv").unlink()
@@ -236,7 +236,7 @@ def test_a_list_that_cannot_be_used_says_which_line(tmp_path):
     fill(tmp_path / "f", 2)
     path = tmp_path / "list.txt"
     path.write_text("0 f/0.png\nf/1.png\n")
-    assert "f/1.png has no time and others have" in refused(path)
+    assert "f/1.png has no time, but others do" in refused(path)
     path.write_text("0 f/0.png\n1 f/9.png\n")
     assert "frame 1: f/9.png cannot be read (No such file or directory)" in refused(path)
     path.write_text("0 f/0.png\nwhat is this.\n")
@@ -247,13 +247,13 @@ def test_a_damaged_tar_is_refused(tmp_path):
     files = {f"{i}.png": encoded(i) for i in range(4)}
     whole = pack(tmp_path / "whole.tar", files).read_bytes()
     (tmp_path / "cut.tar").write_bytes(whole[:2500])
-    assert "cut.tar: is not a whole tar file" in refused(tmp_path / "cut.tar")
+    assert "cut.tar: is damaged or incomplete" in refused(tmp_path / "cut.tar")
     (tmp_path / "cut.tar.gz").write_bytes(gzip.compress(whole)[:900])
-    assert "cut.tar.gz: is not a whole tar file" in refused(tmp_path / "cut.tar.gz")
+    assert "cut.tar.gz: is damaged or incomplete" in refused(tmp_path / "cut.tar.gz")
     (tmp_path / "text.tar").write_text("hello")
-    assert "text.tar: is not a whole tar file" in refused(tmp_path / "text.tar")
+    assert "text.tar: is damaged or incomplete" in refused(tmp_path / "text.tar")
     pack(tmp_path / "none.tar", {"a.txt": b"hello"})
-    assert "none.tar: holds no pictures" in refused(tmp_path / "none.tar")
+    assert "none.tar: contains no images" in refused(tmp_path / "none.tar")
 
 
 # Video
@@ -265,7 +265,9 @@ def test_a_video_gives_every_frame_at_the_rate_of_its_container(tmp_path):
     frames = list(source)
     assert [f.time_s for f in frames] == [i / 12.5 for i in range(7)]
     assert all(f.image.shape == (48, 64) for f in frames)
-    assert np.abs(frames[4].image - cv2.cvtColor(picture(4, 64, 48), 6).astype(float)).mean() < 4
+    assert (
+        np.abs(frames[4].image - cv2.cvtColor(random_image(4, 64, 48), 6).astype(float)).mean() < 4
+    )
 
 
 @pytest.mark.parametrize(
@@ -286,7 +288,7 @@ def test_a_truncated_video_gives_what_there_is_and_then_says_so(tmp_path):
     cut = tmp_path / "cut.avi"
     cut.write_bytes(data[: len(data) * 3 // 5])
     delivered = []
-    with pytest.raises(BadFrame, match=r"it ends there, its container announces 30 frames"):
+    with pytest.raises(BadFrame, match=r"is missing; expected 30 frames, as the container states"):
         delivered.extend(open_source(cut))
     assert 10 < len(delivered) < 30
     assert same_frames(delivered[:10], list(open_source(tmp_path / "a.avi").frames(0, 10)))
@@ -309,7 +311,7 @@ for path in sys.argv[1:]:
     except ValueError as error:
         print(error)
 """
-    # Another process: FFmpeg is told once, when it is first used, how much to say.
+    # Another process: FFmpeg reads its log level once, on first use.
     done = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "cut.avi", tmp_path / "text.mp4"],
         capture_output=True,
@@ -327,16 +329,14 @@ def test_what_is_not_a_video_is_refused_in_one_line(tmp_path):
     data = film(tmp_path / "a.mp4", 9, "mp4v").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
     for name in ("text.mp4", "empty.avi", "cut.mp4"):
-        assert f"{name}: is not a video that can be read, or is truncated" in refused(
-            tmp_path / name
-        )
+        assert f"{name}: cannot be read; expected a complete video file" in refused(tmp_path / name)
 
 
 def test_a_video_of_no_frames_is_refused(tmp_path):
     data = film(tmp_path / "a.avi", 1).read_bytes()
     head = data[: data.index(b"movi") + 4]
     (tmp_path / "none.avi").write_bytes(head)
-    assert "none.avi: has no frames that can be decoded" in refused(tmp_path / "none.avi")
+    assert "none.avi: no frame can be decoded" in refused(tmp_path / "none.avi")
 
 
 # Motion and tracks
@@ -364,8 +364,8 @@ def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_
     path = tmp_path / "m.csv"
     for wrong in ("nan", "inf", ""):
         path.write_text(f"v_m_s,w_rad_s\n1,0\n\n{wrong},0.5\n1,0\n")
-        said = refused(path)
-        assert "m.csv: frame 1 (line 4): its motion is v = " in said
+        message = refused(path)
+        assert "m.csv: frame 1 (line 4): its motion is v = " in message
         assert [f.index for f in open_source(path).frames(on_bad_frame=[].append)] == [0, 2]
 
 
@@ -374,9 +374,9 @@ def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_
     [
         ("", "is empty; expected v_m_s,w_rad_s (or vtrans,vrot)"),
         ("\n\n", "is empty"),
-        ("v_m_s,w_rad_s\n", "has a header and no lines after it"),
-        ("speed,turn\n1,2\n", "has the columns speed,turn and no v_m_s; expected v_m_s,w_rad_s"),
-        ("1,2\n3,4\n", "has the columns 1,2 and no v_m_s"),
+        ("v_m_s,w_rad_s\n", "has a header, but no lines"),
+        ("speed,turn\n1,2\n", "has the columns speed,turn, but no v_m_s; expected v_m_s,w_rad_s"),
+        ("1,2\n3,4\n", "has the columns 1,2, but no v_m_s"),
         ("v_m_s,w_rad_s,x_m\n1,2,3\n", "no y_m"),
         ("v_m_s,w_rad_s\n1,2\n1\n", "line 3 has 1 values; expected 2"),
         ("v_m_s,w_rad_s\n1,fast\n", "line 2: w_rad_s is 'fast'; expected a number"),
@@ -386,9 +386,9 @@ def test_motion_that_is_not_finite_is_named_by_its_line_and_may_be_left_out(tmp_
 )
 def test_a_motion_table_that_cannot_be_used_says_why(tmp_path, text, fault):
     (tmp_path / "m.csv").write_text(text)
-    said = refused(tmp_path / "m.csv")
-    assert "m.csv" in said
-    assert fault in said
+    message = refused(tmp_path / "m.csv")
+    assert "m.csv" in message
+    assert fault in message
 
 
 def test_a_table_that_is_not_text_is_refused(tmp_path):
@@ -443,9 +443,9 @@ def test_a_track_that_cannot_be_used_says_why(tmp_path):
     assert "n above 0" in refused(path)
     np.savez(path, t=np.arange(3.0), pos=np.zeros((3, 2)))
     path.write_bytes(path.read_bytes()[:300])
-    assert "t.npz: is not a whole .npz or .npy file" in refused(path)
+    assert "t.npz: is damaged or incomplete" in refused(path)
     path.write_bytes(b"")
-    assert "t.npz: is not a whole .npz or .npy file" in refused(path)
+    assert "t.npz: is damaged or incomplete" in refused(path)
 
 
 class Trap:
@@ -459,10 +459,10 @@ def test_pickles_are_refused_and_not_loaded(tmp_path, monkeypatch):
     boxed = np.array([Trap()], dtype=object)
     np.savez(path, t=np.arange(3.0), pos=np.zeros((3, 2)), more=boxed)
     assert refused(path) == (
-        "t.npz: holds pickled objects, which are never loaded; expected plain arrays"
+        "t.npz: contains pickled objects, which are never loaded; expected plain arrays"
     )
     path.write_bytes(pickle.dumps(Trap()))
-    assert "t.npz: holds pickled objects" in refused(path)
+    assert "t.npz: contains pickled objects" in refused(path)
     assert not Path("sprung").exists()
 
 
@@ -473,10 +473,10 @@ def test_pickles_are_refused_and_not_loaded(tmp_path, monkeypatch):
 def test_what_numpy_did_not_write_is_not_called_a_pickle(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(b"xx")
-    assert refused(path) == (f"{path}: is not an .npz or .npy file; expected one that numpy wrote")
+    assert refused(path) == (f"{path}: is not an .npz or .npy file; expected one written by numpy")
 
 
-def test_an_address_is_told_as_typed_and_stays_what_it_is():
+def test_an_address_is_reported_as_typed_and_stays_unchanged():
     address = "http://example.com/x.mp4"
     assert refused(address).startswith(
         f"{address}: is an address; open it as a camera: camera:http"
@@ -489,7 +489,7 @@ def test_what_is_missing_or_of_no_known_kind_is_refused(tmp_path):
     (tmp_path / "a.doc").write_text("hello")
     assert "a.doc: is of no known kind; expected a video" in refused(tmp_path / "a.doc")
     (tmp_path / "a.png").write_bytes(encoded(0))
-    assert "a.png: is a single picture; expected a video, a folder" in refused(tmp_path / "a.png")
+    assert "a.png: is a single image; expected a video, a folder" in refused(tmp_path / "a.png")
     for rate in (0.0, -1.0, float("nan"), float("inf")):
         assert "frame rate is" in refused(tmp_path, frame_rate_hz=rate)
 
@@ -497,7 +497,7 @@ def test_what_is_missing_or_of_no_known_kind_is_refused(tmp_path):
 def test_a_rendered_world_is_a_source_like_the_others():
     source = open_source("world:corridor?laps=1")
     assert next(iter(source.frames(7, 8, [].append))).index == 7
-    assert "world 'nowhere': there is none" in refused("world:nowhere")
+    assert "world 'nowhere': no such world" in refused("world:nowhere")
 
 
 def test_reading_a_source_twice_gives_the_same_and_stop_cuts_it(tmp_path):

@@ -60,8 +60,8 @@ def refused(act):
 
 def alike(ours, theirs):
     strip = [[f._replace(image=None) for f in frames] for frames in (ours, theirs)]
-    pictures = [[None if f.image is None else f.image[0, 0] for f in s] for s in (ours, theirs)]
-    return strip[0] == strip[1] and pictures[0] == pictures[1]
+    images = [[None if f.image is None else f.image[0, 0] for f in s] for s in (ours, theirs)]
+    return strip[0] == strip[1] and images[0] == images[1]
 
 
 def film(path, n, fps=30.0, code="MJPG"):
@@ -107,12 +107,12 @@ def test_distance_and_turn_are_conserved_whatever_the_two_rates_are(seen, moved,
     )
 
 
-def test_a_camera_of_30_hz_among_motion_of_100_hz_shows_every_picture_once():
+def test_a_camera_of_30_hz_among_motion_of_100_hz_shows_every_image_once():
     seen, moved = np.arange(31) / 30.0, np.arange(101) / 100.0
     frames = list(Streams(camera_at(seen, 30.0), motion_at(moved, rate=100.0)))
-    with_picture = [f for f in frames if f.image is not None]
-    np.testing.assert_allclose([f.time_s for f in with_picture], seen, atol=1e-9)
-    assert [f.image[0, 0] for f in with_picture] == list(range(31))
+    with_image = [f for f in frames if f.image is not None]
+    np.testing.assert_allclose([f.time_s for f in with_image], seen, atol=1e-9)
+    assert [f.image[0, 0] for f in with_image] == list(range(31))
     assert len(frames) == 31 + 101 - 11  # they meet every tenth of a second
     assert all(f.velocity == (1.0, 0.5) for f in frames)
 
@@ -151,7 +151,7 @@ def test_what_is_sensed_is_that_of_a_sample_within_half_a_period_or_none():
     assert all((f.truth is None) == (f.heading_rad is None) for f in frames)
 
 
-def test_the_motion_source_is_believed_before_the_camera():
+def test_the_motion_source_has_priority_over_the_camera():
     times = np.arange(4.0)
     camera = camera_at(times, 1.0, truth=Pose(1, 1, 1), ranges=np.ones(3))
     motion = motion_at(times, rate=1.0, truth=Pose(2, 2, 2), walls=np.zeros((1, 2)))
@@ -190,7 +190,7 @@ def test_no_more_is_read_ahead_than_a_frame_of_each():
         assert motion.made <= np.sum(moved <= frame.time_s + 1e-6) + 1
 
 
-def test_a_bad_frame_is_raised_or_left_out_and_told_once():
+def test_a_bad_frame_is_raised_or_skipped_and_reported_once():
     seen, moved = np.arange(10) / 5.0, np.arange(20) / 10.0
     camera, motion = camera_at(seen), motion_at(moved, np.column_stack([moved, moved]))
     camera.listed[3], motion.listed[10] = "camera: frame 3 is torn", "motion: frame 10 is mad"
@@ -222,28 +222,28 @@ def test_sources_that_do_not_overlap_are_refused_with_both_ranges():
     camera, motion = camera_at(np.arange(0.0, 3.0)), motion_at(np.arange(10.0, 15.0))
     for one, two in ((camera, motion), (motion, camera)):
         assert refused(lambda one=one, two=two: Streams(one, two)) == (
-            "camera runs from 0 to 2 s and motion runs from 10 to 14 s; "
-            "expected an overlap: are their clocks the same?"
+            "camera runs from 0 s to 2 s and motion runs from 10 s to 14 s; "
+            "expected an overlap; check that both use one clock"
         )
 
 
-def test_a_video_whose_end_is_unknown_is_refused_when_it_has_been_read(tmp_path):
+def test_a_video_of_unknown_length_is_refused_after_reading(tmp_path):
     film(tmp_path / "a.mkv", 9, 10.0, "mp4v")
     log(tmp_path / "m.csv", np.arange(5.0, 9.0))
     source = open_source(f"{tmp_path}/a.mkv+{tmp_path}/m.csv")
-    said = refused(lambda: list(source))
-    assert "a.mkv runs from 0 to 0.8 s" in said
-    assert "m.csv runs from 5 to 8 s" in said
+    message = refused(lambda: list(source))
+    assert "a.mkv runs from 0 s to 0.8 s" in message
+    assert "m.csv runs from 5 s to 8 s" in message
 
 
-def test_pictures_before_and_after_the_motion_are_counted():
+def test_images_before_and_after_the_motion_are_counted():
     merged = Streams(camera_at(np.arange(10.0)), motion_at([1.0, 2.0, 3.5]))
     assert merged.unused == ()
     for _ in range(2):
         assert [f.time_s for f in merged] == [1.0, 2.0, 3.0, 3.5]
         assert merged.unused == (
-            "motion begins at 1 s; 1 picture before it was not used",
-            "motion ends at 3.5 s; 6 pictures after it were not used",
+            "motion begins at 1 s; 1 image before it was not used",
+            "motion ends at 3.5 s; 6 images after it were not used",
         )
     inside = Streams(camera_at([1.0, 2.0]), motion_at(np.arange(5.0)))
     list(inside)
@@ -252,17 +252,17 @@ def test_pictures_before_and_after_the_motion_are_counted():
     merged = Streams(unknown, motion_at([0.0, 2.0]))
     unknown.frames, unknown.n_frames = lambda **_: iter(unknown.listed), None
     list(merged)
-    assert merged.unused == ("motion ends at 2 s; the pictures after it were not used",)
+    assert merged.unused == ("motion ends at 2 s; the images after it were not used",)
 
 
 def test_two_of_a_kind_are_refused():
     times = np.arange(3.0)
-    assert "neither has pictures; expected a camera and motion" in refused(
+    assert "neither source has images; expected a camera and a source of motion" in refused(
         lambda: Streams(motion_at(times), motion_at(times))
     )
     assert "camera has no motion" in refused(lambda: Streams(camera_at(times), camera_at(times)))
     bad = Listed("log", ["torn"])
-    assert "log: has no frame that can be used" in refused(lambda: Streams(camera_at(times), bad))
+    assert "log: has no usable frame" in refused(lambda: Streams(camera_at(times), bad))
 
 
 def test_a_video_and_a_log_are_opened_by_their_names_with_a_plus(tmp_path):
@@ -287,8 +287,8 @@ def test_a_file_with_a_plus_in_its_name_is_that_file(tmp_path, monkeypatch):
     merged = open_source("a+b.csv+c+d.avi")
     assert isinstance(merged, Streams)
     assert [f.time_s for f in merged] == [0.0, 1.0]
-    said = refused(lambda: open_source("a+b.csv+none.avi"))
-    assert "a+b.csv+none.avi: a+b.csv is there, 'none.avi' is not" in said
+    message = refused(lambda: open_source("a+b.csv+none.avi"))
+    assert "a+b.csv+none.avi: a+b.csv exists, 'none.avi' does not" in message
 
 
 def test_a_camera_may_be_merged_with_a_walk_and_its_walls(tmp_path):

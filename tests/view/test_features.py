@@ -30,7 +30,7 @@ def texture(seed=0, height=64, width=96):
 
 
 def filters(seed=0, channels=16):
-    """Two layers that halve the picture four times, with weights of their own."""
+    """Two layers that halve the image four times, with weights of their own."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return nn.Sequential(
@@ -77,17 +77,17 @@ def test_brightness_of_features_does_not_matter_and_silence_is_grey():
 
 
 @pytest.mark.parametrize("grey", [False, True])
-def test_a_place_is_learnt_once_and_recognised_after(grey):
+def test_a_view_is_learnt_once_and_matched_afterwards(grey):
     cells = LocalViewCells(ViewConfig(**SMALL), filters())
-    pictures = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
-    first, again = [[cells(p) for p in pictures] for _ in range(2)]
+    images = [texture(seed)[..., 0] if grey else texture(seed) for seed in range(6)]
+    first, again = [[cells(p) for p in images] for _ in range(2)]
     assert [m.template for m in first] == [m.template for m in again] == list(range(6))
     assert all(m.is_new for m in first)
     assert all(m.error == 0.0 for m in again)
     assert cells(np.full((64, 96), 9, np.uint8)).template == -1  # it shows nothing
 
 
-def test_a_shifted_picture_is_recognised_within_the_range():
+def test_a_shifted_image_is_recognised_within_the_range():
     cells = LocalViewCells(ViewConfig(**SMALL, threshold=0.03), filters())
     wide = texture(3, width=256 + 128)
     cells(wide[:, 64:320])
@@ -100,11 +100,11 @@ def test_a_turned_panorama_is_a_rolled_template(turn):
     """Exactly, where a column of the template is one of the features: edges are not seen."""
     config = ViewConfig(**SMALL | {"shift_match": 0}, panoramic=True)
     cells = LocalViewCells(config, filters())
-    picture = texture(2, width=16 * 16)
-    ahead, turned = cells.encode(picture), cells.encode(np.roll(picture, -16 * turn, axis=1))
+    image = texture(2, width=16 * 16)
+    ahead, turned = cells.encode(image), cells.encode(np.roll(image, -16 * turn, axis=1))
     np.testing.assert_allclose(turned, np.roll(ahead, -turn, axis=1), atol=1e-5)
-    cells(picture)
-    match = cells(np.roll(picture, -16 * turn, axis=1))
+    cells(image)
+    match = cells(np.roll(image, -16 * turn, axis=1))
     assert not match.is_new
     assert match.relative_heading_rad == pytest.approx(-2 * math.pi * turn / 16)
 
@@ -144,34 +144,34 @@ def test_a_network_without_a_layer_ends_at_its_last_features(squeezenet):
 
 
 @pytest.mark.parametrize(
-    ("features", "weights", "said"),
+    ("features", "weights", "message"),
     [
         ("squeezenet1_1", "none.pth", "no such file"),
         ("squeezenet1_1", "text.pth", "cannot be read; expected the state_dict"),
-        ("squeezenet1_1", "list.pth", "holds no state_dict"),
-        ("squeezenet9", "squeezenet.pth", "near it are squeezenet1_1"),
-        ("squeezenet1_1.features.77", "squeezenet.pth", "its parts are features, classifier"),
+        ("squeezenet1_1", "list.pth", "contains no state_dict"),
+        ("squeezenet9", "squeezenet.pth", "similar names: squeezenet1_1"),
+        ("squeezenet1_1.features.77", "squeezenet.pth", "after its name: features, classifier"),
         ("resnet18", "squeezenet.pth", "not of resnet18"),
     ],
 )
-def test_what_is_wrong_with_weights_is_said(features, weights, said, squeezenet):
+def test_errors_of_weights_are_reported(features, weights, message, squeezenet):
     (squeezenet / "text.pth").write_text("no weights")
     torch.save([torch.zeros(2)], squeezenet / "list.pth")
-    with pytest.raises(ConfigError, match=said) as error:
+    with pytest.raises(ConfigError, match=message) as error:
         load_network(features, squeezenet / weights)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("view", "said"),
+    ("view", "message"),
     [
         ({"features": "resnet18"}, "features resnet18 needs weights"),
-        ({"weights": "a.pth"}, "weights are of a named network, and features is grey"),
-        ({"features": "module", "weights": "a.pth"}, "and features is module"),
+        ({"weights": "a.pth"}, "weights belong to a named network, but features is grey"),
+        ({"features": "module", "weights": "a.pth"}, "but features is module"),
     ],
 )
-def test_name_and_weights_belong_together(view, said):
-    with pytest.raises(ValueError, match=said):
+def test_name_and_weights_belong_together(view, message):
+    with pytest.raises(ValueError, match=message):
         ViewConfig(**view)
 
 
@@ -185,17 +185,17 @@ class Gives(nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("found", "error", "said"),
+    ("found", "error", "message"),
     [
-        (torch.zeros(1, 4, 5), ConfigError, r"gives \(1, 4, 5\); expected features"),
-        ({"out": 1}, ConfigError, "gives dict; expected features"),
+        (torch.zeros(1, 4, 5), ConfigError, r"returns \(1, 4, 5\); expected features"),
+        ({"out": 1}, ConfigError, "returns dict; expected features"),
         (torch.zeros(1, 4, 3, 5, dtype=torch.int64), ConfigError, "expected features"),
-        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "not all finite"),
-        (nn.Conv2d(3, 4, 200), ConfigError, "fails on a picture of 96x64 px"),
+        (torch.full((1, 4, 3, 5), math.nan), BadFrame, "are not finite"),
+        (nn.Conv2d(3, 4, 200), ConfigError, "fails on an image of 96x64 px"),
     ],
 )
-def test_what_is_wrong_with_a_network_is_said(found, error, said):
-    with pytest.raises(error, match=said):
+def test_errors_of_a_network_are_reported(found, error, message):
+    with pytest.raises(error, match=message):
         LocalViewCells(ViewConfig(**SMALL), Gives(found))(texture())
 
 
@@ -243,7 +243,9 @@ def test_a_brain_says_which_network_it_needs(tour, tmp_path):
     brain = lived(tour[:50], filters())
     save_brain(brain, path)
     assert load_brain(path).map.n == brain.map.n  # to look at it, no network is needed
-    with pytest.raises(ConfigError, match=r"none was passed; pass it .*load_brain\(path, feat"):
+    with pytest.raises(
+        ConfigError, match=r"no network was passed; pass it .*load_brain\(path, feat"
+    ):
         load_brain(path)(tour[50])
     with pytest.raises(ConfigError, match="views of the map were made with other weights"):
         load_brain(path, features=filters(seed=1))(tour[50])
@@ -277,7 +279,7 @@ def test_after_a_gap_the_network_makes_the_views_of_a_new_map(tour):
     assert brain.view.network_digest == brain.stored[0].view.network_digest != 0
 
 
-def test_networks_without_weights_are_told_apart_by_their_parts():
+def test_networks_without_weights_are_distinguished_by_their_parts():
     pooled = [FeatureEncoder(ViewConfig(**SMALL), nn.AvgPool2d(size)).digest for size in (4, 8, 4)]
     assert pooled[0] == pooled[2] != pooled[1]
 
@@ -310,11 +312,11 @@ def weights_of(name, folder):
 def test_a_transformer_that_has_its_channels_last_is_taken_where_they_are_first(tmp_path):
     path = weights_of("swin_t", tmp_path)
     assert load_network("swin_t", path)(torch.rand(1, 3, 96, 192)).shape == (1, 768, 7, 14)
-    with pytest.raises(ConfigError, match=r"channels last; name swin_t\.permute"):
+    with pytest.raises(ConfigError, match=r"channels last; use swin_t\.permute"):
         load_network("swin_t.features", path)
 
 
-def test_a_network_that_reckons_with_tensors_can_be_made(tmp_path):
+def test_a_network_that_computes_its_widths_with_tensors_can_be_made(tmp_path):
     path = weights_of("regnet_y_400mf", tmp_path)
     assert load_network("regnet_y_400mf.trunk_output", path)(torch.rand(1, 3, 64, 64)).ndim == 4
 
@@ -328,7 +330,7 @@ class Transformer(nn.Module):
 
 
 def test_a_network_that_only_takes_its_own_size_is_one_line():
-    with pytest.raises(ConfigError, match=r"fails on a picture of 96x64 px \(Wrong image width!"):
+    with pytest.raises(ConfigError, match=r"fails on an image of 96x64 px \(Wrong image width!"):
         FeatureEncoder(ViewConfig(**SMALL), Transformer())(texture())
 
 
@@ -339,9 +341,11 @@ def test_a_name_is_no_network():
 
 def test_maps_of_two_networks_are_not_merged(first, tour):
     other = lived(tour[:60], filters(seed=1))
-    assert "the weights of 'module', by which views were made" in find_match(first, other).reason
+    assert (
+        "the weights of the network of views, 'module', differ" in find_match(first, other).reason
+    )
     for brain in (other, NavigationBrain(config_of(), features=filters(seed=1))):
-        with pytest.raises(ConfigError, match="another config: the weights of 'module'"):
+        with pytest.raises(ConfigError, match="weights of the network of views, 'module'"):
             brain.store(first)
 
 
@@ -369,8 +373,8 @@ def test_a_run_with_a_network(call, mistake, squeezenet, tmp_path, monkeypatch):
     monkeypatch.chdir(elsewhere)  # the weights are where they were
     assert call("resume", tmp_path / "near", "--stop", 12).code == 0
     missing = ["--set", "view.weights=none.pth"]
-    said = mistake("run", WORLD, "--out", tmp_path / "other", *given, *missing)
-    assert f"view.weights = '{elsewhere / 'none.pth'}': no such file" in said
+    message = mistake("run", WORLD, "--out", tmp_path / "other", *given, *missing)
+    assert f"view.weights = '{elsewhere / 'none.pth'}': no such file" in message
 
 
 def test_networks_are_compared_on_the_corridor(shared, squeezenet, tmp_path, mistake):
@@ -381,7 +385,7 @@ def test_networks_are_compared_on_the_corridor(shared, squeezenet, tmp_path, mis
     assert [(row["width_px"], row["height_px"]) for row in rows] == [(16, 64), (32, 24)]
     # Weights that were not learnt tell more than chance, 0.11, and less than grey does.
     assert all(0.2 < row["pairs_average_precision"] < 0.5 for row in rows)
-    said = mistake("experiment", "compare", "--out", tmp_path, "--network", f"{name}=x.pth")
-    assert "compares no views; leave --network out" in said
-    said = mistake("experiment", "view-matching", "--out", tmp_path, "--network", name)
-    assert "expected NAME=FILE" in said
+    message = mistake("experiment", "compare", "--out", tmp_path, "--network", f"{name}=x.pth")
+    assert "compares no views; leave --network out" in message
+    message = mistake("experiment", "view-matching", "--out", tmp_path, "--network", name)
+    assert "expected NAME=FILE" in message

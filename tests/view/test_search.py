@@ -51,7 +51,7 @@ def assert_exact(cells, views):
 def always_pruned(monkeypatch):
     """Small memories are searched as large ones: by bounds, and in parts."""
     monkeypatch.setattr(search, "PRUNE_FROM", 100)
-    monkeypatch.setattr(search, "_AT_ONCE", 64)
+    monkeypatch.setattr(search, "_BATCH", 64)
 
 
 def stored(cells):
@@ -151,7 +151,7 @@ def test_with_a_limit_the_search_is_exact_up_to_it(make, limit):
             assert limited.error >= error - 1e-12  # never better than the truth
 
 
-def test_templates_that_differ_by_less_than_a_byte_are_told_apart():
+def test_templates_that_differ_by_less_than_a_byte_are_distinguished():
     """More than a list of the nearest holds; those like the view before the gate do not count."""
     base = smooth(np.random.default_rng(4), 1)[0] * 0.5 + 0.2
     like = base + 1e-8 * np.arange(40)[:, None, None]

@@ -21,17 +21,17 @@ from neuroslam.view.preprocess import block_mean, encode, normalise_mean, normal
 SMALL = {"template_width": 24, "template_height": 8, "shift_match": 3, "threshold": 0.05}
 
 
-def picture(seed=0, height=64, width=96):
+def random_image(seed=0, height=64, width=96):
     """Smooth random texture, as a place looks."""
     noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 4)
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def test_a_place_is_learnt_once_and_recognised_after():
+def test_a_view_is_learnt_once_and_matched_afterwards():
     cells = LocalViewCells(ViewConfig(**SMALL))
-    first = [cells(picture(seed)) for seed in range(10)]
-    again = [cells(picture(seed)) for seed in range(10)]
+    first = [cells(random_image(seed)) for seed in range(10)]
+    again = [cells(random_image(seed)) for seed in range(10)]
     assert [m.template for m in first] == [m.template for m in again] == list(range(10))
     assert all(m.is_new for m in first)
     assert not any(m.is_new for m in again)
@@ -40,7 +40,7 @@ def test_a_place_is_learnt_once_and_recognised_after():
 
 
 @pytest.mark.parametrize("name", ["circuit_launch", "usi_track1"])
-def test_a_real_drive_is_told_apart_as_by_the_reference(shared, name):
+def test_templates_of_a_real_drive_are_those_of_the_reference(shared, name):
     """Of C++ OpenRatSLAM on the same frames, every id is equal and every error."""
     refs = shared / "refs" / "ratslam"
     cells = LocalViewCells(resolve_config("openratslam", refs / f"config_{name}.ini").view)
@@ -56,7 +56,7 @@ def test_a_real_drive_is_told_apart_as_by_the_reference(shared, name):
 @pytest.mark.parametrize("precision", ["uint8", "float64"])
 def test_a_shift_within_the_range_is_forgiven_and_a_larger_one_is_not(precision):
     cells = LocalViewCells(ViewConfig(**SMALL, precision=precision, normalisation=0.0))
-    wide = picture(1, width=96 + 80)
+    wide = random_image(1, width=96 + 80)
     cells(wide[:, 40:136])
     for columns in (-3, -1, 2, 3):  # a column of the template is 4 px
         assert cells(wide[:, 40 + 4 * columns : 136 + 4 * columns]).template == 0
@@ -64,7 +64,7 @@ def test_a_shift_within_the_range_is_forgiven_and_a_larger_one_is_not(precision)
 
 
 def test_colour_is_seen_as_its_grey():
-    colour = np.stack([picture(seed) for seed in range(3)], axis=2)
+    colour = np.stack([random_image(seed) for seed in range(3)], axis=2)
     grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
     config = ViewConfig(**SMALL)
     np.testing.assert_array_equal(encode(colour, config).template, encode(grey, config).template)
@@ -72,9 +72,9 @@ def test_colour_is_seen_as_its_grey():
 
 @pytest.mark.parametrize("panoramic_turn", range(-11, 13))
 def test_a_panorama_gives_the_turn_since_it_was_learnt(panoramic_turn):
-    """Turning to the left moves the picture to the right."""
+    """Turning to the left moves the image to the right."""
     cells = LocalViewCells(ViewConfig(**SMALL | {"shift_match": 0}, panoramic=True))
-    view = picture(3)
+    view = random_image(3)
     cells(view)
     seen = cells(np.roll(view, 4 * panoramic_turn, axis=1))
     assert seen.template == 0
@@ -84,7 +84,7 @@ def test_a_panorama_gives_the_turn_since_it_was_learnt(panoramic_turn):
 
 def test_forward_views_have_no_relative_heading():
     cells = LocalViewCells(ViewConfig(**SMALL))
-    view = picture(3)
+    view = random_image(3)
     cells(view)
     assert cells(np.roll(view, 8, axis=1)).relative_heading_rad == 0.0
 
@@ -108,7 +108,7 @@ def test_a_stream_that_shows_nothing_makes_and_matches_nothing(stream):
 
 def test_light_is_normalised_away():
     cells = LocalViewCells(ViewConfig(**SMALL))
-    view = picture(5)
+    view = random_image(5)
     cells(view)
     assert cells((view * 0.6).astype(np.uint8)).template == 0
 
@@ -151,15 +151,15 @@ def test_patch_normalisation_is_that_of_its_definition():
     [
         (
             {"crop": (0, 100, 0, 64)},
-            r"view\.crop = \[0, 100, 0, 64\].*not inside the picture of 96x64",
+            r"view\.crop = \[0, 100, 0, 64\].*not inside the image of 96x64",
         ),
-        ({"crop": (10, 10, 0, 64)}, "not inside the picture"),
-        ({"crop": (0, 20, 0, 64)}, "24x8 is larger than the cropped picture of 20x64"),
+        ({"crop": (10, 10, 0, 64)}, "not inside the image"),
+        ({"crop": (0, 20, 0, 64)}, "24x8 is larger than the cropped image of 20x64"),
     ],
 )
 def test_a_crop_that_does_not_fit_is_named(config, message):
     with pytest.raises(ConfigError, match=message):
-        LocalViewCells(ViewConfig(**SMALL, **config))(picture())
+        LocalViewCells(ViewConfig(**SMALL, **config))(random_image())
 
 
 @pytest.mark.parametrize(
@@ -168,16 +168,16 @@ def test_a_crop_that_does_not_fit_is_named(config, message):
 def test_state_dict_is_complete(config):
     cells = LocalViewCells(ViewConfig(**SMALL, **config))
     for seed in range(20):
-        cells(picture(seed))
+        cells(random_image(seed))
     copy = LocalViewCells(cells.config)
     copy.load_state_dict(cells.state_dict())
     for seed in (3, 19, 30, 31):
-        assert copy(picture(seed)) == cells(picture(seed))
+        assert copy(random_image(seed)) == cells(random_image(seed))
     for (name, a), b in zip(cells.state_dict().items(), copy.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
 
 
-def test_a_template_takes_at_most_700_bytes_all_told():
+def test_a_template_takes_at_most_700_bytes_in_total():
     view = LocalViewCells(ViewConfig(template_width=60, template_height=10, shift_match=5))
     tables = (view.templates, PoseCellNetwork(PoseCellConfig()).bindings)
     sizes = sum(
@@ -188,10 +188,10 @@ def test_a_template_takes_at_most_700_bytes_all_told():
     assert sizes <= 700
 
 
-def test_a_template_can_be_looked_at():
+def test_a_template_can_be_read_as_an_image():
     cells = LocalViewCells(ViewConfig(**SMALL))
-    cells(picture(2))
-    wanted = np.rint(encode(picture(2), cells.config).template * 255)
+    cells(random_image(2))
+    wanted = np.rint(encode(random_image(2), cells.config).template * 255)
     np.testing.assert_array_equal(cells.template_image(0), wanted)
 
 
@@ -201,7 +201,7 @@ def test_the_gate_skips_templates_of_another_mean(precision):
         **SMALL, normalisation=0.0, mean_gate=True, min_contrast=0.0, precision=precision
     )
     cells = LocalViewCells(config)
-    view = picture(4) // 2
+    view = random_image(4) // 2
     cells(view)
     brighter = cells(view + 60)
     assert brighter.is_new
@@ -212,24 +212,24 @@ def test_the_gate_skips_templates_of_another_mean(precision):
 @pytest.mark.parametrize(
     ("image", "got"),
     [
-        (picture() / 255.0, r"float64 \(64, 96\)"),
-        (picture().astype(np.uint16), r"uint16 \(64, 96\)"),
-        (np.stack([picture()] * 4, axis=2), r"uint8 \(64, 96, 4\)"),
-        (np.stack([picture()] * 3), r"uint8 \(3, 64, 96\)"),
-        (picture()[..., None], r"uint8 \(64, 96, 1\)"),
+        (random_image() / 255.0, r"float64 \(64, 96\)"),
+        (random_image().astype(np.uint16), r"uint16 \(64, 96\)"),
+        (np.stack([random_image()] * 4, axis=2), r"uint8 \(64, 96, 4\)"),
+        (np.stack([random_image()] * 3), r"uint8 \(3, 64, 96\)"),
+        (random_image()[..., None], r"uint8 \(64, 96, 1\)"),
     ],
     ids=["float", "16 bit", "with alpha", "channels first", "one channel"],
 )
-def test_a_picture_of_another_kind_is_refused_and_not_taken_for_black(image, got):
+def test_an_image_of_another_kind_is_refused_and_not_taken_for_black(image, got):
     cells = LocalViewCells(ViewConfig(**SMALL))
-    with pytest.raises(BadFrame, match=rf"picture is {got}; expected uint8, \(h, w\) or"):
+    with pytest.raises(BadFrame, match=rf"image is {got}; expected uint8, \(h, w\) or"):
         cells(image)
     assert cells.n == 0
 
 
 def test_a_view_of_another_size_is_neither_compared_nor_stored():
     cells = LocalViewCells(ViewConfig(**SMALL))
-    view = cells.encode(picture())
+    view = cells.encode(random_image())
     cells.learn(view)
     for wrong in (view.T, view[:, 1:]):
         for use in (cells.learn, cells.search):
@@ -238,8 +238,8 @@ def test_a_view_of_another_size_is_neither_compared_nor_stored():
 
 
 @pytest.mark.parametrize("template", [-1, 1])
-def test_a_template_that_is_not_there_cannot_be_looked_at(template):
+def test_reading_a_missing_template_is_an_error(template):
     cells = LocalViewCells(ViewConfig(**SMALL))
-    cells(picture())
+    cells(random_image())
     with pytest.raises(MapError, match=f"no template {template}; there are 1"):
         cells.template_image(template)

@@ -182,7 +182,7 @@ def test_no_wall_is_seen_through_the_wall_between_two_rooms():
     assert through_the_door[0, 1] == pytest.approx(1.2)
 
 
-def test_who_stands_at_a_wall_sees_it_and_not_through_it():
+def test_a_position_at_a_wall_sees_it_but_not_through_it():
     square = named_arena("square")
     at_wall = [(1.0 + 1e-12, 0.25), (1.0 - 1e-12, 0.25), (1.0, 0.25)]
     assert square.contains(at_wall).all()
@@ -288,13 +288,13 @@ BOX = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda: Arena([(0, 0), (1, 0)]), "arena: the boundary has shape (2, 2); expected"),
-        (lambda: Arena([(0, 0), (1, 0), (1, 0)]), "side 1 has no length"),
-        (lambda: Arena([*BOX, (0, 0)]), "side 4 has no length"),
-        (lambda: Arena([(0, 0), (1, 1), (1, 0), (0, 1)]), "meets itself at sides 0 and 2"),
-        (lambda: Arena([(0, 0), (2, 0), (1, 0)]), "meets itself"),
+        (lambda: Arena([(0, 0), (1, 0), (1, 0)]), "side 1 has length 0"),
+        (lambda: Arena([*BOX, (0, 0)]), "side 4 has length 0"),
+        (lambda: Arena([(0, 0), (1, 1), (1, 0), (0, 1)]), "crosses itself at sides 0 and 2"),
+        (lambda: Arena([(0, 0), (2, 0), (1, 0)]), "crosses itself"),
         (lambda: Arena([(0, 0), (1, np.nan), (1, 1)]), "not finite"),
         (lambda: Arena.circle(-0.5), "radius -0.5 m; expected more than 0"),
         (lambda: Arena.circle(np.nan), "not finite"),
@@ -309,19 +309,19 @@ BOX = [(0, 0), (2, 0), (2, 2), (0, 2)]
         (lambda: Arena(BOX, walls=[[(1, 1), (3, 1)]]), "crosses the boundary or a hole"),
         (lambda: Arena(BOX, [(1, 1, 0.3)], [[(0, 1), (2, 1)]]), "crosses the boundary or a hole"),
         (lambda: Arena(BOX, walls=[[(3, 1), (4, 1)]]), "lies outside the arena"),
-        (lambda: Arena(BOX, walls=[[(1, 1), (1, 1)]]), "wall 0 has no length"),
+        (lambda: Arena(BOX, walls=[[(1, 1), (1, 1)]]), "wall 0 has length 0"),
         (lambda: Arena(BOX, walls=[[(1, 1), (1, np.inf)]]), "wall 0 has shape"),
         (lambda: Arena.rooms(2, door_m=1.0), "expected at least 1 room"),
         (lambda: Arena.from_arrays({"pos": np.zeros(3)}, "x.npz"), "x.npz: has the arrays pos; ex"),
         (lambda: Arena(BOX).check_inside([(1, 1), (3, 1)]), "position 1 is (3, 1) m, outside"),
         (lambda: Arena(BOX).walls_near((1, 1), 0.3), "positions of shape (2,); expected (n, 2)"),
         (lambda: Arena(BOX).walls_near([(1, 1)], 0.0), "reach_m is 0.0; expected"),
-        (lambda: Arena(BOX).ranges([(1, 1)], 0.0, 8, 1.0), "one heading a position"),
+        (lambda: Arena(BOX).ranges([(1, 1)], 0.0, 8, 1.0), "one heading per position"),
         (lambda: named_arena("maze"), "no arena is named 'maze'; expected one of"),
     ],
 )
-def test_what_is_no_arena_is_refused_in_one_line(make, says):
+def test_an_invalid_arena_is_a_one_line_error(make, message):
     with pytest.raises(SourceError) as error:
         make()
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)

@@ -50,42 +50,45 @@ def test_random_worlds_follow_from_the_seed():
 
 def test_worlds_are_read_from_files(tmp_path):
     file = tmp_path / "world.json"
-    told = [{"name": "DOOR", "position_m": [0, 1]}, {"name": "W", "boxes_m": [[[0, 0], [1, 0.1]]]}]
-    file.write_text(json.dumps({"landmarks": told, "view_radius_m": 0.5}), encoding="utf-8")
+    landmarks = [
+        {"name": "DOOR", "position_m": [0, 1]},
+        {"name": "W", "boxes_m": [[[0, 0], [1, 0.1]]]},
+    ]
+    file.write_text(json.dumps({"landmarks": landmarks, "view_radius_m": 0.5}), encoding="utf-8")
     world = read_world(file)
     assert world.names == ("DOOR", "W")
     assert world.view_radius_m == 0.5
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
-        ("{", "not a world"),
+        ("{", "is no world"),
         ('{"landmarks": [{"name": "A"}]}', "position_m"),
         ('{"landmarks": []}', "at least one"),
-        ('{"landmarks": [{"name": "A", "position_m": [3, 0]}]}', "must lie within"),
+        ('{"landmarks": [{"name": "A", "position_m": [3, 0]}]}', "expected corners within"),
     ],
 )
-def test_files_that_are_no_worlds_are_refused(tmp_path, content, said):
+def test_files_that_are_no_worlds_are_refused(tmp_path, content, message):
     file = tmp_path / "world.json"
     file.write_text(content, encoding="utf-8")
-    with pytest.raises(SourceError, match=said):
+    with pytest.raises(SourceError, match=message):
         read_world(file)
     with pytest.raises(SourceError, match="cannot be read"):
         read_world(tmp_path / "none.json")
 
 
 @pytest.mark.parametrize(
-    ("position", "said"),
+    ("position", "message"),
     [((2.0, 0.0), "outside the bounds"), ((np.nan, 0.0), "not a number"), ((0.0,), "expected")],
 )
-def test_positions_that_cannot_be_are_refused(position, said):
-    with pytest.raises(SourceError, match=said):
+def test_positions_that_cannot_be_are_refused(position, message):
+    with pytest.raises(SourceError, match=message):
         random_world().observe(np.array(position))
 
 
 def test_unknown_and_double_landmarks_are_refused():
-    with pytest.raises(SourceError, match="no landmark 'X'; there is L0"):
+    with pytest.raises(SourceError, match="no landmark 'X'; expected one of L0"):
         random_world().named("X")
     with pytest.raises(SourceError, match="twice"):
         make_world([point("A", (0, 0)), point("A", (0, 1))])
@@ -134,16 +137,16 @@ def test_two_rooms_and_kitti_and_a_rat_are_paths(shared):
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "message"),
     [
         ([[0, 0]] * 3, "at least 4"),
-        ([[np.nan, 0]] * 9, "must be numbers"),
-        ([[1, 2]] * 9, "one place"),
+        ([[np.nan, 0]] * 9, "a position is not finite"),
+        ([[1, 2]] * 9, "all positions are equal"),
     ],
 )
-def test_files_that_are_no_paths_are_refused(tmp_path, rows, said):
+def test_files_that_are_no_paths_are_refused(tmp_path, rows, message):
     np.save(tmp_path / "path.npy", np.array(rows, dtype=float))
-    with pytest.raises(SourceError, match=said):
+    with pytest.raises(SourceError, match=message):
         read_path(tmp_path / "path.npy")
 
 

@@ -93,20 +93,20 @@ def test_rows_without_numbers_or_with_a_time_that_does_not_rise_are_dropped_and_
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "is empty; expected time_s,x_m,y_m: seconds and metres"),
-        ("time_s,x_m,y_m\n", "has a header and no lines"),
-        ("time_s,x_m\n0,1\n", "has the columns time_s,x_m and no y_m"),
+        ("time_s,x_m,y_m\n", "has a header, but no lines"),
+        ("time_s,x_m\n0,1\n", "has the columns time_s,x_m, but no y_m"),
         ("time_s,x_m,y_m\n0,1,here\n", "line 2: y_m is 'here'; expected a number"),
-        ("time_s,x_m,y_m\n0,1,1\n", "1 of its 1 rows have numbers and a time that rises"),
-        ("time_s,x_m,y_m\n1,1,1\n0,1,1\n2,,\n", "1 of its 3 rows"),
+        ("time_s,x_m,y_m\n0,1,1\n", "1 of 1 rows have numbers and a rising time"),
+        ("time_s,x_m,y_m\n1,1,1\n0,1,1\n2,,\n", "1 of 3 rows"),
     ],
 )
-def test_a_walk_that_cannot_be_used_says_why(tmp_path, text, says):
+def test_a_walk_that_cannot_be_used_says_why(tmp_path, text, message):
     path = tmp_path / "w.csv"
     path.write_text(text)
-    assert says in refused(lambda: read_walk(path))
+    assert message in refused(lambda: read_walk(path))
     assert "w.csv" in refused(lambda: read_walk(path))
 
 
@@ -117,12 +117,12 @@ def test_a_damaged_or_missing_npz_is_refused(tmp_path):
     )
     walk = {"t": np.arange(3.0), "pos": np.eye(3, 2)}
     np.savez(path, **walk, spikes_s=np.zeros((2, 2)))
-    assert "spikes_s is (2, 2); expected (m,)" in refused(lambda: read_walk(path))
+    assert "spikes_s has shape (2, 2); expected times (m,)" in refused(lambda: read_walk(path))
     np.savez(path, **walk, vertices=np.eye(2))
     refused(lambda: read_walk(path))
     np.savez(path, **walk)
     path.write_bytes(path.read_bytes()[:100])
-    assert "is not a whole .npz" in refused(lambda: read_walk(path))
+    assert "is damaged or incomplete" in refused(lambda: read_walk(path))
 
 
 def test_a_walk_of_wrong_shape_or_order_is_refused():
@@ -402,7 +402,7 @@ def test_senses_hold_no_nan_and_a_walk_without_an_arena_has_no_walls():
 
 def test_a_negative_factor_is_refused():
     for factor in (-1.0, math.nan):
-        with pytest.raises(ConfigError, match="expected a number from 0 on"):
+        with pytest.raises(ConfigError, match="expected a finite number, at least 0"):
             SenseNoise().scaled(factor)
 
 
@@ -451,7 +451,8 @@ def test_ranges_lead_to_the_walls_and_come_in_place_of_them():
     off = np.array([noisy.frame(i).ranges - exact.frame(i).ranges for i in range(200)])
     assert off.std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_array_equal(noisy.frame(7).ranges, noisy.frame(7).ranges)
-    assert "its walls are not known" in refused(lambda: ArenaSource(wander(arena=None), beams=60))
+    message = refused(lambda: ArenaSource(wander(arena=None), beams=60))
+    assert "has no arena, so no ranges" in message
 
 
 def test_a_track_with_an_arena_opens_with_its_walls(shared, tmp_path):
@@ -464,10 +465,10 @@ def test_a_track_with_an_arena_opens_with_its_walls(shared, tmp_path):
     assert not isinstance(open_source(tmp_path / "w.npz"), ArenaSource)
 
 
-def test_rows_that_a_track_with_an_arena_lost_are_a_fault_that_may_be_left_out(tmp_path):
+def test_dropped_rows_of_a_track_with_an_arena_are_one_bad_frame(tmp_path):
     path = tmp_path / "w.npz"
     np.savez(path, t=np.arange(4.0), pos=[[0, 0], [1, 0], [np.nan, 0], [3, 0]], arena_radius=5.0)
-    assert "1 of its rows have no numbers" in refused(lambda: list(open_source(path)))
+    assert "1 row has no numbers" in refused(lambda: list(open_source(path)))
     faults = []
     frames = list(open_source(path).frames(on_bad_frame=faults.append))
     assert [f.time_s for f in frames] == [0, 1, 3]
@@ -493,7 +494,7 @@ def test_a_recorded_walk_is_opened_with_noise_length_and_rate(shared):
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         ("arena:nowhere", "'nowhere'"),
         ("arena:square?minute=3", "arena 'square': unknown option 'minute'"),
@@ -503,18 +504,18 @@ def test_a_recorded_walk_is_opened_with_noise_length_and_rate(shared):
         ("arena:nowhere.npz", "nowhere.npz: no such file"),
     ],
 )
-def test_an_arena_that_cannot_be_opened_says_why(spec, says):
-    assert says in refused(lambda: open_source(spec))
+def test_an_arena_that_cannot_be_opened_says_why(spec, message):
+    assert message in refused(lambda: open_source(spec))
 
 
 def test_an_unknown_arena_is_refused_with_the_choices():
-    said = refused(lambda: open_source("arena:nowhere"))
-    assert all(name in said for name in ARENAS)
+    message = refused(lambda: open_source("arena:nowhere"))
+    assert all(name in message for name in ARENAS)
 
 
 def test_a_recording_without_an_arena_is_not_opened_as_one(tmp_path):
     np.savez(tmp_path / "w.npz", t=np.arange(3.0), pos=np.eye(3, 2))
-    assert "has no arena in it; expected vertices (n, 2) or arena_radius" in refused(
+    assert "contains no arena; expected vertices (n, 2) or arena_radius" in refused(
         lambda: open_source(f"arena:{tmp_path}/w.npz")
     )
 

@@ -78,7 +78,7 @@ def test_truth_closes_after_whole_laps_exactly(name):
     assert np.array_equal(truths[: lap + 1], truths[lap:])
 
 
-def test_another_start_visits_the_same_places_and_sees_the_same_pictures():
+def test_another_start_visits_the_same_places_and_sees_the_same_images():
     first = open_world("world:ellipse?laps=0.75")
     second = open_world("world:ellipse?laps=3&start=0.4")
     shift = round(0.4 * first.frames_per_lap)
@@ -131,7 +131,7 @@ def test_every_noise_term_does_what_its_unit_says(level, seed):
         assert not change[0].any()
 
 
-def test_noise_shifts_the_measurement_but_neither_truth_nor_picture():
+def test_noise_shifts_the_measurement_but_neither_truth_nor_image():
     clean, noisy = open_world("world:corridor"), open_world("world:corridor?noise=0.05&seed=1")
     assert np.array_equal(clean.truths(), noisy.truths())
     assert np.array_equal(clean.frame(9).image, noisy.frame(9).image)
@@ -153,7 +153,7 @@ def test_the_panorama_rolls_when_the_robot_turns_on_the_spot():
         assert np.mean(difference > 3) < 0.005  # rounding moves a few edges by a pixel
 
 
-def test_the_picture_moves_right_when_the_robot_turns_left():
+def test_the_image_moves_right_when_the_robot_turns_left():
     world, camera = build_world("corridor"), Camera(160, 64)
     before = render(world, Pose(0.0, -3.25, 0.0), camera).mean(axis=(0, 2))
     after = render(world, Pose(0.0, -3.25, 0.1), camera).mean(axis=(0, 2))
@@ -250,7 +250,7 @@ def test_places_look_different(name):
                 assert np.abs(images[i] - images[j]).mean() > 8
 
 
-def test_people_change_pictures_but_not_truth():
+def test_pedestrians_change_images_but_not_truth():
     empty, busy = open_world("world:corridor"), open_world("world:corridor?people=6")
     assert np.array_equal(empty.truths(), busy.truths())
     changed = [
@@ -263,7 +263,7 @@ def test_people_change_pictures_but_not_truth():
     assert not np.array_equal(busy.frame(0).image, busy.frame(lap).image)
 
 
-def test_a_person_behind_a_wall_is_not_seen():
+def test_a_pedestrian_behind_a_wall_is_not_visible():
     world, camera = build_world("corridor"), Camera(160, 64)
     here, kind = Pose(0.0, -3.25, 0.0), world.people[0][0]
     billboard = type(world.billboards[0])
@@ -273,7 +273,7 @@ def test_a_person_behind_a_wall_is_not_seen():
     assert np.array_equal(empty, hidden)
     columns = np.flatnonzero(np.any(empty != seen, axis=(0, 2)))
     assert pytest.approx(columns.mean(), abs=1.5) == 79.5
-    assert pytest.approx(np.ptp(columns), abs=7) == 80 * 0.8 / 3.0  # its picture has clear margins
+    assert pytest.approx(np.ptp(columns), abs=7) == 80 * 0.8 / 3.0  # its image has clear margins
 
 
 def test_light_drifts_slowly_within_its_bounds_and_leaves_the_truth_alone():
@@ -294,7 +294,7 @@ def test_gain_darkens_a_whole_session():
     assert ratio == pytest.approx(0.6, abs=0.01)
 
 
-def test_another_look_paints_other_pictures_on_the_same_walls():
+def test_another_look_paints_other_images_on_the_same_walls():
     one, other = build_world("corridor"), build_world("corridor", look=1)
     assert np.array_equal(one.walls, other.walls)
     assert not np.array_equal(one.strips[0][0], other.strips[0][0])
@@ -315,7 +315,7 @@ def test_a_campus_drive_can_be_twenty_thousand_frames_long():
     assert source.frame(source.n_frames - 1).image.std() > 15
 
 
-def test_every_world_says_what_it_is():
+def test_every_world_has_a_description():
     for name, line in catalogue().items():
         assert 20 < len(line) < 100
         assert build_world(name).description == line
@@ -324,9 +324,9 @@ def test_every_world_says_what_it_is():
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("world:coridor", "world 'coridor': there is none; there are corridor, ellipse, .*"
+        ("world:coridor", "world 'coridor': no such world; expected one of corridor, ellipse, .*"
          "; did you mean 'corridor'?"),
-        ("world:", "world '': there is none; there are corridor, .*"),
+        ("world:", "world '': no such world; expected one of corridor, .*"),
         ("world:town?lapps=2", "world 'town': unknown option 'lapps'; there are laps, start, .*"
          "; did you mean 'laps'?"),
         ("world:town?laps", "world 'town': option 'laps' has no value; write laps=VALUE once"),
@@ -337,13 +337,13 @@ def test_every_world_says_what_it_is():
         ("world:town?route=7", "world 'town': route 7 does not exist; expected 1 to 6"),
     ],
 )  # fmt: skip
-def test_mistakes_are_told_in_one_line(spec, message):
+def test_mistakes_are_one_line_errors(spec, message):
     with pytest.raises(SourceError, match=f"^{message.replace('?', '[?]')}$") as caught:
         open_world(spec)
     assert "\n" not in str(caught.value)
 
 
-def test_a_frame_that_is_not_there_is_told():
+def test_a_missing_frame_is_an_error():
     source = WorldSource("corridor", WorldOptions(laps=0.1))
     with pytest.raises(SourceError, match="world:corridor: no frame 99; expected 0 to 34"):
         source.frame(99)

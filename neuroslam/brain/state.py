@@ -1,0 +1,366 @@
+"""State of a brain: modules, populations, sessions, and stored maps."""
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from torch import nn
+
+from neuroslam.brain.compass import Compass
+from neuroslam.brain.continuity import Continuity
+from neuroslam.brain.recognition import Recognition, StoredViews
+from neuroslam.config import BrainConfig
+from neuroslam.errors import ConfigError, counted
+from neuroslam.geometry import compose
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.overlap import n_places
+from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
+from neuroslam.merging.mapped import counts_of, differing
+from neuroslam.merging.match import shared_history
+from neuroslam.merging.merge import merge
+from neuroslam.merging.report import MergeReport
+from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.state.match import Match
+from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
+from neuroslam.state.population import Population
+from neuroslam.state.registry import leading_class, population_classes
+from neuroslam.state.sessions import Session, SessionLog, session_id
+from neuroslam.state.tables import Scalars
+from neuroslam.types import NO_TEMPLATE, Frame, Pose, ViewMatch
+from neuroslam.view.features import Encoder, view_encoder
+from neuroslam.view.templates import LocalViewCells
+
+if TYPE_CHECKING:
+    from neuroslam.cells.head_direction import HeadDirectionCells
+    from neuroslam.cells.navigation import NavigationCells
+    from neuroslam.cells.pose import PoseCellNetwork
+    from neuroslam.cells.speed import SpeedCells
+    from neuroslam.spiking.semantic import SemanticCells
+
+
+class Clock(Scalars, AboutNow):
+    """Present frame and time."""
+
+    frame: int
+    time_s: float
+    frames_seen: int
+
+
+class BrainState(nn.Module):
+    """State of a brain, its merging and its stored maps; a subclass processes frames.
+
+    Args:
+        config: All parameters.
+        features: Network that computes views, if ``config.view.features`` is ``"module"``.
+    """
+
+    clock: Clock
+    odometry: VisualOdometry
+    view: LocalViewCells
+    map: ExperienceMap
+    # Populations of the package, if config.cells names them:
+    pose_cells: "PoseCellNetwork"
+    navigation: "NavigationCells"
+    semantic: "SemanticCells"
+    head_direction: "HeadDirectionCells"
+    speed: "SpeedCells"
+    compass: Compass
+    sessions: SessionLog
+    recognition: Recognition
+    continuity: Continuity
+    stored: "ModulesOf[Self]"
+
+    def __init__(
+        self, config: BrainConfig | None = None, *, features: nn.Module | Encoder | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config or BrainConfig()
+        self._encoder = view_encoder(self.config.view, features)
+        # Source, preset and date of the next session.
+        self.about: tuple[str, str, str] = ("", "", "")
+        self._detects = self.config.sessions.kidnapped == "detect"
+        self._after_gap_s = -math.inf  # time of a frame that was refused after a gap
+        self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
+        self.stored = ModulesOf()
+        self._begin()
+        self.register_load_state_dict_pre_hook(_make_stored)
+        self.register_load_state_dict_post_hook(lambda module, _: module._changed())
+
+    def _begin(self) -> None:
+        """Start with an empty map."""
+        config, cells = self.config, self.config.pose_cells
+        self.odometry = VisualOdometry(config.odometry)
+        self.view = LocalViewCells(config.view, self._encoder)
+        self.map = ExperienceMap(
+            config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
+        )
+        leader = leading_class(config)
+        for population in population_classes(config):
+            setattr(self, population.name, population.build(config, leader))
+        self.compass = Compass()
+        self.sessions = SessionLog()
+        self.recognition = Recognition()
+        self.continuity = Continuity(config)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Update what is derived from populations and stored maps."""
+        self._stored_views: StoredViews | None = None
+        classes = population_classes(self.config)
+        self._populations: dict[str, Population] = {
+            cls.kind: getattr(self, cls.name) for cls in classes
+        }
+        leader = leading_class(self.config)
+        self._leads = leader.kind
+        # Only overridden hooks are called.
+        self._with = {
+            hook: [p for p in self._populations.values() if _overrides(type(p), hook)]
+            for hook in ("observe", "check", "step", "vetoes", "follow", "learn", "recall")
+        }
+        self._makes_views = any(cls.needs_views for cls in classes)
+        uses = {cls.compass for cls in classes}
+        self._has_compass = bool(uses - {"ignores"})
+        self._compass_turns_map = (
+            leader.relaxes_map and self._has_compass and "corrects" not in uses
+        )
+
+    @property
+    def populations(self) -> dict[str, Population]:
+        """The populations by kind, in the order of their steps."""
+        return self._populations
+
+    @property
+    def leader(self) -> Population:
+        """The population that decides about experiences."""
+        return self._populations[self._leads]
+
+    def parts(self) -> dict[str, Mergeable]:
+        """Return the parts of the state, by name."""
+        return {name: p for name, p in self.named_children() if isinstance(p, Mergeable)}
+
+    def merge(self, partial: Self, match: Match) -> tuple[Self | None, MergeReport]:
+        """Merge the map of another session into this one; neither brain is altered.
+
+        Args:
+            partial: The brain whose session continues; its activity, time and odometry are kept.
+            match: Match of the two maps, from :func:`~neuroslam.merging.match.find_match`.
+
+        Returns:
+            The merged brain, or ``None`` if the merge is refused, and the report.
+
+        Raises:
+            MapError: If the match names experiences that do not exist.
+        """
+        state, _, report = merge(self, partial, match)
+        if state is None:
+            return None, report
+        merged = type(self)(partial.config)
+        merged.restore(state, [*map(deepcopy, self.stored), *map(deepcopy, partial.stored)])
+        merged.to(partial.map.experiences["pose"].device)
+        counts = [counts_of(brain) for brain in (self, partial, merged)]
+        report.counts |= {
+            name: dict(zip(("loaded", "partial", "merged"), values, strict=True))
+            for name, value in counts[2].items()
+            if name not in report.counts and isinstance(value, int)
+            for values in ([count[name] for count in counts],)
+        }
+        merged.sessions.merges.append(report.to_dict())
+        return merged, report
+
+    def store(self, other: Self) -> None:
+        """Store the maps of another brain; each is joined to this map once it is recognised.
+
+        Args:
+            other: The other brain, which is not altered; its own stored maps are stored too.
+
+        Raises:
+            ConfigError: If the configs of views or populations differ, or the networks of views.
+        """
+        self.view.load_network()
+        apart = differing(self, other)
+        if apart:
+            raise ConfigError(
+                f"the stored map has another config: {'; '.join(apart)}; "
+                "run with the config of the stored map"
+            )
+        for one in (other, *other.stored):
+            if one.map.n:
+                self._store_one(one)
+        self._changed()
+
+    def _store_one(self, one: Self) -> None:
+        copy = type(self)(one.config)
+        copy.restore(one.state_dict(), [])
+        for i, before in enumerate(self.stored):
+            shared = shared_history(before, copy)
+            merged = before.merge(copy, shared.match)[0] if shared and shared.match else None
+            if merged is not None:  # two continuations of one map
+                self.stored[i] = merged
+                return
+        self.stored.append(copy)
+        self.recognition.store()
+
+    def start_new_map(self, why: str = "kidnapped") -> None:
+        """Store the present map and continue with an empty one, as after a kidnapping.
+
+        The stored map is joined again once it is recognised.
+
+        Args:
+            why: ``kidnapped`` or ``gap``; stored with the new session.
+        """
+        if not self.map.n:
+            return
+        before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
+        senses = self.odometry, self.continuity  # kept: they compare successive frames
+        kept = type(self)(self.config)
+        kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
+        self.stored.append(kept)
+        self._begin()
+        self.odometry, self.continuity = senses
+        for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
+            self.recognition.tally.append(alike=alike, agreed=agreed)
+        self.recognition.store()
+        session = Session(
+            session_id(before.id, clock.frames_seen, why),
+            before.source,
+            before.preset,
+            before.recorded,
+            clock.frame + 1,
+            clock.time_s,
+            began=why,
+            continues=before.id,
+        )
+        self._open(session)
+
+    def restore(self, state: State, stored: Sequence[Self]) -> None:
+        """Replace the state and the stored maps."""
+        self._begin()
+        self.stored = ModulesOf(stored)
+        own = {name: value for name, value in state.items() if not name.startswith("stored.")}
+        for i, one in enumerate(stored):
+            own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
+        self.load_state_dict(own)
+        tally = self.recognition.tally
+        rows = {name: tally[name][: len(stored)] for name in tally.columns}
+        tally.replace(**rows)
+        while tally.n < len(stored):
+            tally.append(alike=0, agreed=0)
+
+    def _open(self, session: Session) -> None:
+        self.sessions.sessions.append(session)
+        self.map.state.session = session.id
+
+    def _recognise(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
+        """Join a stored map if enough recent experiences match it."""
+        config, recognition = self.config.sessions, self.recognition
+        if not len(self.stored):
+            return False
+        recognition.arrive(WINDOW * config.confirm)
+        if self._stored_views is None:
+            self._stored_views = StoredViews([one.view for one in self.stored])
+        where, seen = self._stored_views.search(encoded)
+        if seen.template == NO_TEMPLATE:
+            return False
+        loaded = self.stored[where].map
+        templates = loaded.experiences["template"].numpy()
+        recognition.note(
+            where,
+            np.flatnonzero(templates == seen.template),
+            self.map.current,
+            seen.relative_heading_rad - view.relative_heading_rad,
+            seen.error,
+        )
+        limits = tolerance((loaded, self.map), self.config)
+        agreed = recognition.confirmed(where, loaded, self.map, limits)
+        if n_places(agreed) < config.confirm:
+            return False
+        near = templates[~elsewhere(loaded, int(agreed.loaded[-1]), limits)]
+        match = Match(
+            loaded=int(agreed.loaded[-1]),
+            partial=self.map.current,
+            turn_rad=float(agreed.turn_rad[-1]),
+            error=seen.error,
+            runner_up=self._stored_views.runner_up(encoded, where, near),
+            others=agreed.pick(slice(-1)),
+        )
+        return self._join(where, match, frame)
+
+    def _join(self, where: int, match: Match, frame: Frame) -> bool:
+        """Join stored map ``where``, and then those that share a session with it."""
+        rest = [one for i, one in enumerate(self.stored) if i != where]
+        loaded, everything, tally = self.stored[where], self.stored, self.recognition.tally
+        self.stored = ModulesOf()  # the other stored maps are not copied
+        merged, report = loaded.merge(self, match)
+        self.stored = everything
+        report.at_frame = frame.index
+        if merged is None:
+            self.recognition.forget()
+            self.sessions.refusals.append(report.to_dict())
+            return False
+        merged.sessions.merges[-1] = report.to_dict()
+        for name, part in merged.parts().items():
+            setattr(self, name, part)
+        self.view.encoder = self._encoder
+        self.stored = ModulesOf(rest)
+        rows = zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True)
+        for i, (alike, agreed) in enumerate(rows):
+            if i != where:
+                self.recognition.tally.append(alike=alike, agreed=agreed)
+        self._changed()
+        for i, one in enumerate(rest):
+            shared = shared_history(one, self)
+            if shared is not None and shared.match is not None:
+                self._join(i, shared.match, frame)
+                break
+        return True
+
+    def not_joined(self) -> list[dict[str, object]]:
+        """Return for each stored map how much of it was recognised, for the report of a run."""
+        tally, needed = self.recognition.tally, self.config.sessions.confirm
+        return [
+            {
+                "sessions": [session.name for session in one.sessions.sessions],
+                "experiences": one.map.n,
+                "places_that_look_alike": alike,
+                "places_that_agree": agreed,
+                "reason": "maps without views are merged when they are finished: neuroslam merge"
+                if not self._makes_views
+                else f"{counted(alike, 'experience')} matched by view, at most {agreed} agreed on "
+                f"the alignment; expected {needed}",
+            }
+            for one, alike, agreed in zip(
+                self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
+            )
+        ]
+
+    @property
+    def landmarks_m(self) -> np.ndarray | None:
+        """Points that populations draw on the map, ``(n, 2)`` in metres; ``None``: no points."""
+        points = [p.points_m() for p in self._populations.values()]
+        known = [rows for rows in points if rows is not None]
+        return np.concatenate(known) if known else None
+
+    def place(self, experience: int, offset: Pose) -> Pose:
+        """Return the pose on the present map of a robot at ``offset`` from an experience.
+
+        Args:
+            experience: Id, or -1 for the origin before the first experience.
+            offset: Pose relative to that experience, the ``map.offset`` at that time.
+        """
+        if experience < 0:
+            return offset
+        return compose(Pose(*self.map.experiences["pose"][experience].tolist()), offset)
+
+
+def _overrides(population: type[Population], hook: str) -> bool:
+    return getattr(population, hook) is not getattr(Population, hook)
+
+
+def _make_stored(module: BrainState, state: State, prefix: str, *_unused: object) -> None:
+    """Create as many stored maps as a state has."""
+    inside = f"{prefix}stored."
+    numbers = {int(key[len(inside) :].split(".")[0]) for key in state if key.startswith(inside)}
+    if len(numbers) != len(module.stored):
+        module.stored = ModulesOf(type(module)(module.config) for _ in numbers)

@@ -1,0 +1,123 @@
+"""Merge of the landmarks of two sessions."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from neuroslam.config.semantic import SemanticConfig
+from neuroslam.geometry import wrap_angle
+from neuroslam.spiking.landmark_frames import rotated
+from neuroslam.spiking.sightings import NAMELESS, VIEW
+from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, landmark_pointer
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import State
+from neuroslam.types import Pose
+
+
+class LandmarkCells(Protocol):
+    """What a merge uses of :class:`~neuroslam.spiking.semantic.SemanticCells`."""
+
+    config: SemanticConfig
+    follows: str
+    known: Vocabulary
+    slam: SSPSLAM
+    now: SemanticState
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the robot."""
+
+    def moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
+        """Move positions of the partial session into the loaded frame."""
+
+    def write_memory(self) -> None:
+        """Rewrite the memory from ``known``."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> object:
+        """Load a state."""
+
+    def state_dict(self) -> State:
+        """Return the state."""
+
+
+@torch.no_grad()
+def merge_landmarks(
+    make: Callable[[], LandmarkCells], loaded: State, partial: State, join: Join
+) -> State:
+    """Merge the landmarks of two sessions in the frame of the loaded one, into a new memory.
+
+    Landmarks of the same name become one, views as in the merge of the maps, nameless ones by
+    position. Where the positions differ, that of the partial session, the later one, holds.
+
+    Args:
+        make: Makes empty semantic cells like those that merge.
+        loaded: State of the loaded session.
+        partial: State of the session that goes on.
+        join: How ids and coordinates of the partial session change.
+    """
+    one, other, merged = (make() for _ in range(3))
+    one.load_state_dict(loaded)
+    other.load_state_dict(partial)
+    there = other.moved(other.known["place_m"].numpy(), join)
+    keys = {key: row for row, key in enumerate(one.known.row_of)}
+    columns: dict[str, list[Any]] = {c: one.known[c].tolist() for c in one.known.columns}
+    free = sum(kind == NAMELESS for kind, _ in keys)
+    for row, (kind, number) in enumerate(other.known.row_of):
+        if kind == VIEW:
+            number = int(join.views[number])
+        elif kind == NAMELESS:
+            number, free = _same_nameless(one, there[row], free)
+        theirs = {c: other.known[c][row].tolist() for c in columns}
+        at = keys.get((kind, number))
+        if theirs["experience"] >= 0:
+            theirs["experience"] = int(join.experiences[theirs["experience"]])
+            turn = float(join.turns_rad[other.known["experience"][row]])
+            theirs["offset_m"] = rotated(np.array(theirs["offset_m"]), turn).tolist()
+        if at is None:
+            keys[kind, number] = len(columns["kind"])
+            for c, value in (theirs | {"number": number, "place_m": there[row].tolist()}).items():
+                columns[c].append(value)
+            continue
+        mine = np.array(columns["place_m"][at])
+        agree = np.linalg.norm(mine - there[row]) < one.config.same_m
+        columns["place_m"][at] = ((mine + there[row]) / 2 if agree else there[row]).tolist()
+        columns["seen"][at] += theirs["seen"]
+        columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
+    return _written(merged, other, columns, join)
+
+
+def _written(
+    merged: LandmarkCells, session: LandmarkCells, columns: dict[str, list[Any]], join: Join
+) -> State:
+    """Write landmarks into new cells, which continue the partial session; return their state."""
+    dtypes = {c: session.known[c].dtype for c in columns}
+    shape = {c: session.known[c].shape[1:] for c in columns}
+    merged.known.replace(
+        **{c: torch.tensor(v, dtype=dtypes[c]).reshape(-1, *shape[c]) for c, v in columns.items()}
+    )
+    merged.known.index()
+    slam = merged.slam
+    if merged.known.row_of:
+        pointers = torch.stack(
+            [landmark_pointer(merged.config, *key) for key in merged.known.row_of]
+        )
+        slam.pointers = pointers.to(slam.pointers)
+        merged.write_memory()
+    now = session.moved(np.array([session.pose[:2]]), join)[0]
+    slam.time_s = session.slam.time_s.clone()
+    slam.start(torch.tensor(now[None]))
+    for name in session.now.kinds:
+        setattr(merged.now, name, getattr(session.now, name))
+    turn = join.rotation_rad if session.follows == "map" else join.cells_turn_rad
+    merged.now.heading_rad = wrap_angle(session.now.heading_rad + turn)
+    merged.now.told = -1
+    return merged.state_dict()
+
+
+def _same_nameless(one: LandmarkCells, place_m: np.ndarray, free: int) -> tuple[int, int]:
+    """Return the number of a nameless landmark in a merge, and the next free number."""
+    row, _ = one.known.nearest_nameless(place_m, one.config.same_m)
+    return (int(one.known["number"][row]), free) if row >= 0 else (free, free + 1)

@@ -1,0 +1,138 @@
+"""What a population answers when it is asked, checked: numbers, pictures and tables.
+
+Runs, reports and TensorBoard ask through these functions, so that a population of a user's may
+answer by NumPy's or torch's numbers, and a wrong answer is told by the name of who gave it.
+"""
+
+import re
+from collections.abc import Mapping
+from numbers import Real
+
+import numpy as np
+from torch import Tensor
+
+from neuroslam.state.population import Correction, Picture, Population
+
+RUN_TABLES = ("frames.csv", "experiences.csv", "links.csv")
+"""Tables that every run writes: a population's must be called otherwise."""
+
+RUN_FIGURES = (
+    "frames", "seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s", "templates",
+    "views", "experiences", "links", "loop_closures", "merges", "merge_reports", "refused_merges",
+    "not_joined", "frames_on_no_joined_map", "skipped_frames", "skipped", "unused", "pictures",
+    "tables", "interrupted", "ate_rmse_m", "odometry_ate_rmse_m",
+)  # fmt: skip
+"""Figures that every run has: a population's counts must be called otherwise."""
+
+
+def counts_of(population: Population) -> dict[str, float]:
+    """Return what a population has learnt, as plain numbers by name.
+
+    Raises:
+        TypeError: If it is anything else, or a name is one of :data:`RUN_FIGURES`.
+    """
+    counts = _numbers(population, "counts", population.counts())
+    for name in counts.keys() & set(RUN_FIGURES):
+        raise TypeError(f"{_who(population)}.counts(): {name!r} is a figure of every run; rename")
+    return counts
+
+
+def scalars_of(population: Population) -> dict[str, float]:
+    """Return a population's curves now, as plain numbers by tag.
+
+    Raises:
+        TypeError: If it is anything else.
+    """
+    return _numbers(population, "scalars", population.scalars())
+
+
+def pictures_of(population: Population) -> dict[str, Picture]:
+    """Return a population's pictures as arrays by tag; those that have no pixel are left out.
+
+    Raises:
+        TypeError: If one is no array, ``(h, w)`` or ``(h, w, 3)``, nor a tuple of the former.
+    """
+    pictures: dict[str, Picture] = {}
+    for tag, picture in _named(population, "images", population.images()).items():
+        layered = isinstance(picture, tuple | list)
+        layers = tuple(_array(layer) for layer in (picture if layered else (picture,)))
+        coloured = [layer.dtype == np.uint8 and layer.shape[2:] == (3,) for layer in layers]
+        if any(layer.ndim != 2 and (layered or not rgb)
+               for layer, rgb in zip(layers, coloured, strict=True)):  # fmt: skip
+            shapes = ", ".join(f"{layer.dtype} {layer.shape}" for layer in layers)
+            raise TypeError(
+                f"{_who(population)}.images(): {tag!r} is {shapes}; expected an array (h, w), a "
+                "tuple of such, or uint8 (h, w, 3)"
+            )
+        if layers and all(layer.size for layer in layers):
+            pictures[tag] = layers if layered else layers[0]
+    return pictures
+
+
+def tables_of(population: Population) -> dict[str, str]:
+    """Return a population's CSV tables by the name of the file.
+
+    Raises:
+        TypeError: If a table is no text that begins with its columns, or its name is no plain
+            file name that ends in ``.csv``, or one of :data:`RUN_TABLES`.
+    """
+    tables = _named(population, "tables", population.tables())
+    for name, text in tables.items():
+        if not re.fullmatch(r"[\w-]+\.csv", name) or name in RUN_TABLES:
+            raise TypeError(
+                f"{_who(population)}.tables(): {name!r} is not a name for it; expected one like "
+                f"{population.kind}.csv"
+            )
+        if not isinstance(text, str) or not text.partition("\n")[0].strip():
+            raise TypeError(
+                f"{_who(population)}.tables(): {name!r} is {text!r:.40}; expected text whose first "
+                "line has the columns"
+            )
+    return dict(tables)
+
+
+def moves_others(population: Population | None, correction: Correction | None) -> bool:
+    """Tell whether others have to follow what ``step`` or ``recall`` has returned.
+
+    Raises:
+        TypeError: If that is neither a correction nor ``None``.
+    """
+    if correction is None:
+        return False
+    if not isinstance(correction, Correction):
+        raise TypeError(
+            f"{type(population).__name__}: step() or recall() returned "
+            f"{type(correction).__name__}, expected a Correction or None"
+        )
+    return not correction.is_nothing
+
+
+def _numbers(population: Population, hook: str, answer: object) -> dict[str, float]:
+    plain: dict[str, float] = {}
+    for name, value in _named(population, hook, answer).items():
+        if isinstance(value, Tensor | np.ndarray | np.generic) and np.prod(value.shape) == 1:
+            value = value.item()
+        if not isinstance(value, Real):
+            raise TypeError(
+                f"{_who(population)}.{hook}(): {name!r} is {type(value).__name__}, expected a "
+                "number"
+            )
+        plain[name] = int(value) if isinstance(value, bool | int) else float(value)
+    return plain
+
+
+def _named(population: Population, hook: str, answer: object) -> Mapping[str, object]:
+    if not isinstance(answer, Mapping) or not all(isinstance(name, str) for name in answer):
+        raise TypeError(
+            f"{_who(population)}.{hook}(): returned {type(answer).__name__}, expected a dict by "
+            "name"
+        )
+    return answer
+
+
+def _array(picture: object) -> np.ndarray:
+    return picture.numpy(force=True) if isinstance(picture, Tensor) else np.asarray(picture)
+
+
+def _who(population: Population) -> str:
+    return type(population).__name__
