@@ -126,15 +126,16 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     )
     assert told[f"session {second.name}"] == (
         f"{about}130 frames from frame 320, {made[second.id]} experiences "
-        f"({brain.map.aliases.n} of them known), began: start"
+        f"({brain.map.aliases.n} merged into those of other sessions), began: start"
     )
     text = told[f"merge at frame {merge['at_frame']}"]
-    assert text.startswith(f"session {second.name} into {first.name}, 4 places agree, ")
+    assert text.startswith(f"session {second.name} into {first.name}, 4 experiences agree, ")
     assert text.endswith(f"map turned by {np.degrees(merge['rotation_rad']):.1f} degrees")
     assert told["refused merges"] == "0"
     stored = brain.stored[0]
     assert told["stored map 0, not joined"].startswith(
-        f"sessions {stored.sessions.now.name}: {stored.view.n} views, {stored.map.n} experiences, "
+        f"sessions {stored.sessions.now.name}: {stored.view.n} templates, "
+        f"{stored.map.n} experiences, "
     )
 
 
