@@ -108,7 +108,7 @@ def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Te
 
     Args:
         shift: :math:`d` in cells, shape ``(...)``.
-        first: :math:`f`, how far the first row lies from the first column.
+        first: :math:`f`, offset of the first row from the first column.
         n_out: Rows.
         n_in: Columns.
         n: Cells in the ring.

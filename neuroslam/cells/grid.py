@@ -1,4 +1,4 @@
-"""Grid cells: a lateral anti-Hebbian network (LAHN) that finds hexagons in oscillators' phases."""
+"""Grid cells: a lateral anti-Hebbian network (LAHN) that learns hexagons from phases."""
 
 from typing import NamedTuple
 
@@ -16,13 +16,13 @@ _developed: dict[tuple[str, torch.dtype], dict[str, Tensor]] = {}
 
 
 class LAHNWeights(NamedTuple):
-    r"""What a lateral anti-Hebbian network learns.
+    r"""Weights of a lateral anti-Hebbian network.
 
     Attributes:
         feedforward: :math:`Q`, ``(n_modules, n_cells, n_inputs)``, rows of unit norm.
         lateral: :math:`W \le 0`, ``(n_modules, n_cells, n_cells)``, zero diagonal.
-        threshold: Above it a cell learns, ``(n_modules, n_cells)``.
-        bias: Above it a cell fires, the same shape.
+        threshold: Drive above which a cell learns, ``(n_modules, n_cells)``.
+        bias: Drive above which a cell fires, the same shape.
     """
 
     feedforward: Tensor
@@ -53,7 +53,7 @@ def lahn_drive(inputs: Tensor, rates: Tensor, feedforward: Tensor, lateral: Tens
 def lahn_learn(
     inputs: Tensor, drive: Tensor, weights: LAHNWeights, config: GridCellConfig
 ) -> LAHNWeights:
-    r"""Learn from inputs and the drive they caused (Földiák 1990; Oja 1982).
+    r"""Return the weights after learning from inputs and their drive (Földiák 1990; Oja 1982).
 
     .. math:: s &= [\xi - \theta]_+^2, \\
               \Delta Q &= \eta\, s\,(x - (Qx)\,Q)^\top \text{, rows to unit norm}, \\
@@ -67,11 +67,11 @@ def lahn_learn(
     Args:
         inputs: :math:`x`, ``(samples, n_modules, n_inputs)``.
         drive: :math:`\xi`, ``(samples, n_modules, n_cells)``.
-        weights: What was known before.
-        config: Rates of learning.
+        weights: Weights before.
+        config: Learning rates.
 
     Returns:
-        What is known now.
+        Weights after.
     """
     q, w, threshold, bias = weights
     n = len(inputs)
@@ -93,12 +93,12 @@ class LAHNGridCells(BufferModule):
     """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
 
     :func:`lahn_drive` and :func:`lahn_learn` have the mathematics. A network is made with weights
-    that developed on random positions, of no environment; ``learn`` goes on from there.
+    that developed at random positions, without an environment; ``learn`` continues from there.
     State: the parameters ``feedforward`` and ``lateral``, the buffers ``threshold``, ``bias`` and
-    ``rates``, and the generator of its random start. Animals of a batch have one network.
+    ``rates``, and the generator of its random weights. Animals of a batch share one network.
 
     Args:
-        config: Modules, cells, rates of learning.
+        config: Modules, cells, learning rates.
         batch: Number of animals side by side, or ``None`` for one.
 
     Example:
@@ -150,12 +150,12 @@ class LAHNGridCells(BufferModule):
 
     @property
     def weights(self) -> LAHNWeights:
-        """All that is learnt."""
+        """The learnt weights."""
         return LAHNWeights(self.feedforward, self.lateral, self.threshold, self.bias)
 
     @torch.no_grad()
     def develop(self, steps: int) -> None:
-        """Learn from phases at random positions far and wide, as before the eyes open."""
+        """Learn from phases at random positions, before the first frame."""
         c = self.config
         generator = torch.Generator()
         generator.set_state(self.generator_state)
@@ -173,7 +173,7 @@ class LAHNGridCells(BufferModule):
 
     @torch.no_grad()
     def learn(self, inputs: Tensor) -> None:
-        """Learn from inputs, ``(samples, n_modules, 2 * directions)``, as if each was held."""
+        """Learn from inputs, ``(samples, n_modules, 2 * directions)``, at settled rates."""
         q, w, _, bias = self.weights
         rates = (inputs.unsqueeze(-2) @ q.mT).squeeze(-2).sub(bias).clamp_min(0.0)
         learnt = lahn_learn(inputs, lahn_drive(inputs, rates, q, w), self.weights, self.config)
@@ -182,7 +182,7 @@ class LAHNGridCells(BufferModule):
         self.threshold, self.bias = learnt.threshold, learnt.bias
 
     def forward(self, phases: Tensor) -> Tensor:
-        r"""Take in the oscillators' phases and return the rates :math:`[\xi - b]_+`.
+        r"""Return the rates :math:`[\xi - b]_+` for the phases of the oscillators.
 
         Args:
             phases: Cosine and sine, ``([batch,] n_modules, directions, 2)``.

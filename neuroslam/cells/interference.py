@@ -1,4 +1,4 @@
-"""Grid cells by interference of theta oscillations, one of the two models that ours meet."""
+"""Grid cells by interference of theta oscillations, a model for comparison."""
 
 import math
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ Combine = Literal["product", "sum"]
 _WAVE_NUMBER = 4.0 * math.pi / math.sqrt(3.0)
 """Wave number of a hexagonal grid times its spacing."""
 _CYCLE = 24
-"""Phases over which a theta cycle is averaged."""
+"""Samples of a theta cycle for its mean."""
 _SUM_THRESHOLD = 0.6
 """Share of the largest possible sum below which a summing cell is silent."""
 
 
 def phase_step(phase_rad: Tensor, velocity_m_s: Tensor, waves_rad_m: Tensor, dt_s: float) -> Tensor:
-    r"""Let every dendritic oscillator gain on the soma's by the way along its direction.
+    r"""Advance every dendritic oscillator against the soma by the displacement along its direction.
 
     .. math:: \varphi_j \leftarrow \varphi_j + \mathbf k_j \cdot \mathbf v \, dt \pmod{2\pi},
               \qquad |\mathbf k_j| = \beta = \frac{4\pi}{\sqrt 3\,\lambda}
@@ -29,7 +29,7 @@ def phase_step(phase_rad: Tensor, velocity_m_s: Tensor, waves_rad_m: Tensor, dt_
     (Burgess, Barry and O'Keefe 2007: :math:`\omega_j = \omega_s + \beta s \cos(\phi - \phi_j)`.)
 
     Args:
-        phase_rad: :math:`\varphi_j`, how far each is ahead of the soma, ``(..., modules, waves)``.
+        phase_rad: :math:`\varphi_j`, phase of each relative to the soma, ``(..., modules, waves)``.
         velocity_m_s: Allocentric x and y, ``(..., 2)``.
         waves_rad_m: :math:`\mathbf k_j`, ``(modules, waves, 2)``.
         dt_s: Duration of the step.
@@ -50,7 +50,7 @@ def phase_step(phase_rad: Tensor, velocity_m_s: Tensor, waves_rad_m: Tensor, dt_
 def interference(
     phase_rad: Tensor, theta_rad: Tensor, combine: Combine, threshold: float
 ) -> Tensor:
-    r"""Return the rate of cells in which dendritic oscillations meet the soma's.
+    r"""Return the rate of cells in which dendritic and somatic oscillations interfere.
 
     .. math:: f = \Theta\Big(\prod_j \tfrac12\big[\cos(\theta + \varphi_j) + \cos\theta\big] - c
               \Big) / (1 - c), \qquad \Theta(x) = [x]_+
@@ -65,7 +65,7 @@ def interference(
         threshold: :math:`c`, in ``[0, 1)``.
 
     Returns:
-        Rates in ``[0, 1]``, 1 where all are in phase at the crest; shape ``(...)``.
+        Rates in ``[0, 1]``, 1 if all are in phase at the crest; shape ``(...)``.
 
     Example:
         >>> interference(torch.zeros(3), torch.tensor(0.0), "product", threshold=0.0).item()
@@ -79,7 +79,7 @@ def interference(
 def lattice_waves(orientation_rad: Tensor, directions: int) -> Tensor:
     r"""Return unit vectors 60 degrees apart whose stripes meet in a grid of that orientation.
 
-    The wave vectors of a hexagonal grid lie 30 degrees off its axes.
+    The wave vectors of a hexagonal grid are 30 degrees off its axes.
 
     Args:
         orientation_rad: Direction of an axis of the grid, ``(...)``.
@@ -102,19 +102,19 @@ class OscillatoryInterference(nn.Module):
 
     The model of Burgess, Barry and O'Keefe 2007 (Hippocampus 17:801-812); :func:`phase_step` and
     :func:`interference` have the mathematics. Cells of a module share spacing and orientation and
-    differ in where their fields lie. The state is the buffers ``phase_rad`` and ``theta_rad``.
+    differ in the positions of their fields. State: the buffers ``phase_rad`` and ``theta_rad``.
 
     Args:
-        spacings_m: Distance of neighbouring fields, one a module.
+        spacings_m: Distance of neighbouring fields, one for each module.
         n_cells: Cells of each module.
         directions: Dendritic oscillators, 3 or 6; their directions are 60 degrees apart.
-        combine: Whether the soma multiplies the dendrites' interference or adds it up.
+        combine: Whether the soma multiplies or adds the interference of its dendrites.
         theta_hz: Frequency of the soma; ``None``: the mean rate of a theta cycle is returned.
         threshold: Share of the largest response below which a cell is silent; ``None``: 0 for
             the product, 0.6 for the sum.
-        orientations_rad: Direction of a grid axis, one a module; ``None``: drawn.
+        orientations_rad: Direction of a grid axis, one for each module; ``None``: random.
         batch: Number of animals side by side; ``None`` for one.
-        generator: What orientations and fields are drawn from; ``None``: seed 0.
+        generator: Generator of random orientations and fields; ``None``: seed 0.
 
     Raises:
         ConfigError: If a value is out of bounds.
@@ -176,12 +176,12 @@ class OscillatoryInterference(nn.Module):
         waves = lattice_waves(turned, directions)
         self.register_buffer("spacings_m", torch.tensor(list(spacings_m), **like))
         self.register_buffer("directions", waves)
-        # In units of the spacing, so a cell keeps its place in the grid when that is altered.
+        # In units of the spacing, so a cell keeps its phase when the spacing changes.
         self.register_buffer("offset_rad", _WAVE_NUMBER * fields @ waves.transpose(-1, -2))
         self.reset()
 
     def reset(self) -> None:
-        """Put the animal at its origin: all oscillators in phase, theta at its crest."""
+        """Reset the animal to the origin: all oscillators in phase, theta at its crest."""
         lead = () if self.batch is None else (self.batch,)
         zeros = self.offset_rad.new_zeros(lead + self.directions.shape[:2])
         self.register_buffer("phase_rad", zeros)
@@ -225,7 +225,7 @@ class OscillatoryInterference(nn.Module):
 def checked_velocity(
     module: nn.Module, velocity_m_s: Tensor, dt_s: float, batch: int | None
 ) -> Tensor:
-    """Return the velocity, ``([batch,] 2)``, if a step can be made of it.
+    """Return the velocity, ``([batch,] 2)``, after checking it.
 
     Raises:
         MapError: If it has another shape or is not finite, or time runs backward.

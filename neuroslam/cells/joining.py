@@ -1,4 +1,4 @@
-"""How the navigation cells of two sessions become those of one."""
+"""Merge of the navigation cells of two sessions."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ from neuroslam.types import Pose
 
 
 class Frames(NamedTuple):
-    """How the partial session's frame lies in the loaded one's: turn about a point, then move.
+    """Alignment of the partial frame with the loaded one: rotation about a point, then shift.
 
     Attributes:
         pivot: A pose in the partial session's frame.
@@ -33,7 +33,7 @@ class Frames(NamedTuple):
 
     @property
     def turn_rad(self) -> float:
-        """By how much the partial session turns."""
+        """Rotation of the partial session."""
         return wrap_angle(self.onto.theta_rad - self.pivot.theta_rad)
 
     def place(self, points_m: Tensor) -> Tensor:
@@ -53,12 +53,12 @@ class Frames(NamedTuple):
 def join_navigation(loaded: State, partial: State, join: Join) -> State:
     """Merge the states of navigation cells; neither is altered.
 
-    Place cells nearer to each other than ``threshold_m`` become one, and their visits add; where
-    each is an experience of the map, those do that the map has as one. Stretches of wall that both
-    remember become one. The partial session's position moves, and the phases with it.
+    Place cells nearer to each other than ``threshold_m`` become one, and their visits add; if each
+    is an experience of the map, those become one whose experiences do. Stretches of wall that both
+    remember become one. The partial session's position and phases move.
 
     Args:
-        loaded: State that is merged into: its ids stay.
+        loaded: State of the map that is merged into; its ids stay.
         partial: State of the session that goes on.
         join: How ids of views and experiences change.
     """
@@ -83,11 +83,11 @@ def join_navigation(loaded: State, partial: State, join: Join) -> State:
 
 
 def view_frames(loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
-    """Say how the frames of two sessions lie by the views that both know.
+    """Align the frames of two sessions by the views that both know.
 
     Returns:
-        A pose in the partial frame, and the same in the loaded one; ``None`` if no such view was
-        learnt by who knew its place.
+        A pose in the partial frame, and the same in the loaded one; ``None`` if both animals were
+        lost when they learnt those views.
     """
     same = np.flatnonzero(join.views < join.n_views)
     rows = [_seen(partial)[same], _seen(loaded)[join.views[same]]]
@@ -107,7 +107,7 @@ def _seen(state: State) -> np.ndarray:
 
 
 def _same_places(loaded: State, partial: State, frames: Frames) -> np.ndarray:
-    """Number in the merged table of every partial place cell, by distance."""
+    """Return the number of every partial place cell in the merged table, by distance."""
     n, m = (int(state["place.n_cells"][0]) for state in (loaded, partial))
     ids = n + np.arange(m)
     if n and m:
@@ -120,7 +120,7 @@ def _same_places(loaded: State, partial: State, frames: Frames) -> np.ndarray:
 
 
 def _join_grid(loaded: State, partial: State, frames: Frames) -> State:
-    """Keep the loaded network, whose places know it; turn its phases to the new position."""
+    """Keep the loaded network, to which its place cells are tuned; set phases to the position."""
     merged = {n: v for n, v in loaded.items() if n.startswith(("grid.", "oscillators."))}
     position = frames.place(partial["oscillators.position_m"][None])[0]
     merged["oscillators.position_m"] = position
@@ -144,7 +144,7 @@ def _waves(state: State) -> Tensor:
 
 
 def _grid_rates(state: State, at_m: Tensor) -> Tensor:
-    """Return what the network settles to at positions, ``(n, n_modules, n_cells)``."""
+    """Return the settled rates of the network at positions, ``(n, n_modules, n_cells)``."""
     inputs = _phases(state, at_m).flatten(-2).to(state["grid.bias"])
     rates = torch.zeros(len(at_m), *state["grid.bias"].shape)
     for _ in range(_SETTLING_STEPS):
@@ -212,23 +212,23 @@ def _join_familiarity(loaded: State, partial: State, ids: np.ndarray, frames: Fr
 
 
 def _join_walls(loaded: State, partial: State, frames: Frames) -> State:
-    """Put the loaded walls first; a partial one like one of them becomes it."""
+    """Put the loaded walls first; a partial wall that matches one of them becomes it."""
     merged = {k: v for k, v in partial.items() if k.startswith("walls.")}
     n, m = (int(state["walls.n_walls"][0]) for state in (loaded, partial))
     one, other = loaded["walls.walls"][0, :n].clone(), partial["walls.walls"][0, :m].clone()
-    one[:, 5] -= loaded["walls.since.time_s"]  # before the session that goes on began
+    one[:, 5] -= loaded["walls.since.time_s"]  # before the start of the session that goes on
     other[:, :2] = frames.place(other[:, :2])
     other[:, 2] = wrap(other[:, 2] + frames.turn_rad)
     to = n + torch.arange(m)
     if n and m:
         pairs = squared_mismatch(one, other[:, None, :2], other[:, None, 2], loaded["walls.scale"])
-        unlike, nearest = pairs.min(1)
-        # Each loaded wall takes one, the most alike; the others stay.
-        order = unlike.argsort()
+        mismatch, nearest = pairs.min(1)
+        # Each loaded wall matches at most one, that of least mismatch; the others stay.
+        order = mismatch.argsort()
         taken: set[int] = set()
         for k in order.tolist():
             wall = int(nearest[k])
-            if unlike[k] < 1.0 and wall not in taken:
+            if mismatch[k] < 1.0 and wall not in taken:
                 taken.add(wall)
                 to[k] = wall
     kept = (to >= n).nonzero()[:, 0]
@@ -255,19 +255,19 @@ def _join_views(loaded: State, partial: State, join: Join, frames: Frames) -> St
 
 
 def navigation_faults(state: Mapping[str, np.ndarray], n_experiences: int | None) -> Iterator[str]:
-    """Say what makes no sense in a state of navigation cells.
+    """Yield what is invalid in a state of navigation cells.
 
     Args:
-        state: Of the cells, as arrays.
-        n_experiences: That the map has, where each place cell is one; ``None``: it is not.
+        state: State of the cells, as arrays.
+        n_experiences: Number of experiences, if each place cell is one; ``None``: they are not.
     """
     n_cells, n_walls = (int(state[name][0]) for name in ("place.n_cells", "walls.n_walls"))
     if n_experiences not in (None, n_cells):
-        yield f"{n_cells} place cells, {n_experiences} experiences; each should be the other"
+        yield f"{n_cells} place cells, {n_experiences} experiences; expected one for each"
     linked = state["place.neighbours"][0, :n_cells]
     rows = np.unique(np.nonzero((linked < -1) | (linked >= n_cells))[0])
     if len(rows):
-        yield f"place cells {listed(rows)}: linked to cells that are not there; there are {n_cells}"
+        yield f"place cells {listed(rows)}: linked to cells that do not exist; there are {n_cells}"
     norms = np.linalg.norm(state["place.weights"][0, :n_cells], axis=1)
     rows = np.flatnonzero(np.abs(norms - 1.0) > 1e-3)
     if len(rows):

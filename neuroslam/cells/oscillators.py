@@ -1,4 +1,4 @@
-"""Velocity-controlled oscillators: phases that turn as the animal moves, one for each direction."""
+"""Velocity-controlled oscillators: phases that advance with displacement along a direction."""
 
 import math
 
@@ -30,15 +30,15 @@ def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) ->
 
 
 def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor:
-    r"""Turn the oscillators by a displacement.
+    r"""Advance the phases by a displacement.
 
     .. math:: z_j \leftarrow z_j\,e^{i\,\mathbf k_j \cdot \Delta x}
 
     This is the Hopf oscillator :math:`\dot z = i\omega z + z(1 - |z|^2)` on its unit circle, SLRB
     Eqs. 10 and 11, with :math:`\omega_j = \mathbf k_j \cdot \mathbf v` integrated exactly. (Euler
     steps of it leave the unit circle, by half at 15 rad/s. The boundary response that Eqs. 10 and
-    11 add to every frequency turns all phases alike and means nothing; walls correct the phases
-    instead.)
+    11 add to every frequency shifts all phases equally, without effect on the position; walls
+    correct the phases instead.)
 
     Args:
         waves: :math:`\mathbf k`, ``(n_modules, directions, 2)``.
@@ -56,7 +56,7 @@ def turn_phases(waves: Tensor, displacement_m: Tensor, phases: Tensor) -> Tensor
 
 
 def restore_amplitude(phases: Tensor) -> Tensor:
-    r"""Draw oscillators to the unit circle, as :math:`z(1 - |z|^2)` does: takes back rounding.
+    r"""Return oscillators to the unit circle, as :math:`z(1 - |z|^2)` does: removes rounding.
 
     .. math:: z \leftarrow \tfrac12 (3 - |z|^2)\,z
 
@@ -72,7 +72,7 @@ def _turn(waves: Tensor, at_m: Tensor) -> Tensor:
 
 
 def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor) -> Tensor:
-    r"""Find the position, near a given one, that fits all phases best.
+    r"""Decode the position, near a given one, that fits all phases best.
 
     .. math:: x = x_0 + K^{+} \arg\!\big(z\,e^{-iKx_0}\big)
 
@@ -158,7 +158,7 @@ class VelocityOscillators(BufferModule):
         return self.shift(velocity_m_s * dt_s)
 
     def shift(self, displacement_m: Tensor) -> Tensor:
-        """Move by a displacement, ``([batch,] 2)``: all modules by the same, so they agree.
+        """Move all modules by one displacement, ``([batch,] 2)``, so that they stay consistent.
 
         Returns:
             Phases as cosine and sine, ``([batch,] n_modules, directions, 2)``.
@@ -171,7 +171,7 @@ class VelocityOscillators(BufferModule):
         return phases
 
     def decode(self) -> Tensor:
-        """Read the position, ``([batch,] 2)``, from the phases; it had been reckoned since."""
+        """Decode the position, ``([batch,] 2)``, from the phases; else it is integrated."""
         waves, solver = self._kept_waves()
         self.phases = restore_amplitude(self.phases).detach()
         self.position_m = decode_phases(waves, solver, self.phases, self.position_m).detach()

@@ -127,7 +127,7 @@ class PoseCellNetwork(Population):
 
     @property
     def packet(self) -> Packet:
-        """The active window and where it lies on the torus."""
+        """The active window and its origin on the torus."""
         return self._now.packet
 
     @packet.setter

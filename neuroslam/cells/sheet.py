@@ -1,4 +1,4 @@
-"""Grid cells of a periodic sheet, a continuous attractor; one of the two models that ours meet."""
+"""Grid cells of a periodic sheet, a continuous attractor; a model for comparison."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _CALIBRATING_DRIVES = (0.02, 0.05, 0.1)
 
 @dataclass(frozen=True, kw_only=True)
 class SheetParameters:
-    r"""Size and dynamics of a sheet; gains depend on nothing else.
+    r"""Size and dynamics of a sheet; they determine its gains.
 
     Attributes:
         n_y: Cells along y, over :math:`\sqrt 3` periods of the pattern.
@@ -95,7 +95,7 @@ def sheet_weights(parameters: SheetParameters) -> Tensor:
     gamma = p.surround * beta
     weights = (math.pi / gamma) * torch.exp(-squared / (4.0 * gamma))
     weights = weights - (math.pi / beta) * torch.exp(-squared / (4.0 * beta))
-    # As many cells reach a cell here as there; with lambda^2 = 3 / beta in squared periods.
+    # As many cells project to a cell as in the paper; with lambda^2 = 3 / beta in squared periods.
     density = _PAPER_CELLS**2 / (3.0 / beta)
     along = torch.stack([k_x.expand_as(squared), k_y[:, None].expand_as(squared)])
     shifts = p.shift * torch.stack([along[0], -along[0], along[1], -along[1]])
@@ -183,7 +183,7 @@ def settled(parameters: SheetParameters, generator: torch.Generator) -> Tensor:
     noise = torch.rand(p.n_y, p.n_x, generator=generator, dtype=torch.float64)
     rates = (0.1 * noise).expand(4, p.n_y, p.n_x)
     feedforward = _feedforward(rates.new_zeros(2))
-    # All cells are active at first, and inhibit each other more than a long step can follow.
+    # At first all cells are active and inhibit each other too strongly for long steps.
     for fraction in (min(0.05, p.substep), p.substep):
         for _ in range(round(_SETTLING_TAUS / 2.0 / fraction)):
             rates = _relax(rates, feedforward, weights, fraction)
@@ -220,7 +220,7 @@ def calibrated_gains(parameters: SheetParameters) -> tuple[float, float]:
     feedforward = _feedforward(drives)
     rates = settled(p, torch.Generator().manual_seed(0)).expand(len(drives), 4, p.n_y, p.n_x)
     moved = torch.zeros_like(drives)
-    n_substeps = round(4.0 / p.substep)  # too few for a bump to come near its neighbour's place
+    n_substeps = round(4.0 / p.substep)  # too few for a bump to move near that of its neighbour
     for piece in range(15):
         before = rates
         for _ in range(n_substeps):
@@ -237,7 +237,7 @@ class GridSheet(nn.Module):
 
     The model of Burak and Fiete 2009 (PLoS Comput Biol 5:e1000291) with periodic borders and
     without noise; :func:`sheet_step` and :func:`sheet_weights` have the mathematics. Its gain
-    :math:`\alpha` is calibrated for each axis, :func:`calibrated_gains`, so that fields lie
+    :math:`\alpha` is calibrated for each axis, :func:`calibrated_gains`, so that fields are
     ``spacing_m`` apart. The state is the buffer ``sheet``; ``start`` is the settled pattern that
     :meth:`reset` returns to.
 
@@ -247,7 +247,7 @@ class GridSheet(nn.Module):
         orientation_rad: Direction of an axis of the grid.
         parameters: Size and dynamics.
         batch: Number of animals side by side; ``None`` for one. They start with one pattern.
-        generator: What the pattern grows from; ``None``: seed 0.
+        generator: Generator of the noise from which the pattern grows; ``None``: seed 0.
 
     Raises:
         ConfigError: If a value is out of bounds, or no pattern grew.
@@ -308,7 +308,7 @@ class GridSheet(nn.Module):
         self.reset(generator or torch.Generator().manual_seed(0))
 
     def reset(self, generator: torch.Generator | None = None) -> None:
-        """Return to the pattern it was made with, or let a new one settle from drawn noise."""
+        """Return to the pattern it was made with, or let a new one settle from noise."""
         if generator is not None:
             self.start = settled(self.sheet_parameters, generator).to(self.start)
         lead = () if self.batch is None else (self.batch,)
@@ -321,7 +321,7 @@ class GridSheet(nn.Module):
 
     @property
     def fastest_m_s(self) -> float:
-        """Speed at which the drive reaches its limit; who is faster is followed too slowly."""
+        """Speed at which the drive reaches its limit; the pattern lags behind a faster animal."""
         p = self.sheet_parameters
         return p.drive_limit * self.spacing_m * min(calibrated_gains(p))
 

@@ -1,9 +1,9 @@
-r"""Attractors of many brains side by side: the packets of a batch, all in windows of one size.
+r"""Attractors of a batch of brains: packets in windows of one size.
 
 A :class:`~neuroslam.cells.convolve.Packet` of a batch has values ``(brains, a, b, c)`` and an
 origin for each brain, ``(brains, 3)``. The window is as large as the widest packet needs, so a
 step of 64 tracking brains costs a few large products instead of 64 times as many small ones.
-On an accelerator, where shapes had better not depend on values, the window is the whole torus.
+On an accelerator, where shapes should not depend on values, the window is the whole torus.
 """
 
 from functools import lru_cache
@@ -16,7 +16,7 @@ from neuroslam.cells.convolve import Packet
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI
 
-_NEVER = 1 << 20  # places ago: more than any ring has
+_NEVER = 1 << 20  # cells ago: more than any ring has
 
 
 def to_packets(activity: Tensor) -> Packet:
@@ -64,7 +64,7 @@ def trim_all(packets: Packet) -> Packet:
 
 
 def _longest_gaps(active: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
-    """Where activity begins after the longest silence of each ring, and how far it reaches.
+    """Find the start of activity after the longest silence of each ring, and its extent.
 
     Args:
         active: Which cells of the windows are active, ``(3, brains, size)``.
@@ -154,10 +154,10 @@ def move_all(
 def _reaches(
     shifts: tuple[Tensor, ...], sizes: tuple[int, ...], shape: tuple[int, int, int]
 ) -> tuple[Tensor, list[int]]:
-    """Where windows begin after shifts, ``(brains, 3)``, and how many cells they then need."""
+    """Return the origins of windows after shifts, ``(brains, 3)``, and the cells they need."""
     ends = [shift.detach().aminmax(dim=1) for shift in shifts]
     firsts = torch.stack([low for low, _ in ends], dim=1).floor()
-    if tuple(sizes) == shape:  # nothing to find out, and on an accelerator to wait for
+    if tuple(sizes) == shape:  # whole rings: no need to wait for values of an accelerator
         return firsts, list(shape)
     lasts = torch.stack([high for _, high in ends], dim=1).ceil()
     more = (lasts - firsts).amax(0).tolist()

@@ -1,8 +1,8 @@
-r"""Speed cells: rates that rise linearly with running speed, whatever the heading and the place.
+r"""Speed cells: rates that rise linearly with running speed, at any heading and position.
 
-One population in one file: its section of the config, its pure steps with their equations, the
-module, and what becomes of it when two sessions merge. After Kropff et al. (2015, *Nature* 523:
-419): a positive, linear response that runs ahead of the animal by 50 to 80 ms.
+One population in one file: its config section, its pure steps with their equations, the module,
+and the merge of two sessions. After Kropff et al. (2015, *Nature* 523:
+419): a positive, linear response that anticipates by 50 to 80 ms.
 """
 
 import math
@@ -21,7 +21,7 @@ from neuroslam.state.registry import register
 from neuroslam.types import Motion
 
 _SAMPLES = 64
-"""Speeds that the read-out is fitted to."""
+"""Number of speeds at which the read-out is fitted."""
 
 
 class SpeedCellConfig(Section):
@@ -74,12 +74,12 @@ class SpeedCellConfig(Section):
 
 
 class SpeedTuning(NamedTuple):
-    """What cells respond to, one entry for each, ``(n,)``.
+    """Tuning of speed cells, one entry for each, ``(n,)``.
 
     Attributes:
         rest_hz: Rate at rest.
         slope_hz_s_m: Rise of the rate, in Hz for a m/s.
-        lead_s: By how much the cell runs ahead.
+        lead_s: Time by which the cell anticipates the speed.
     """
 
     rest_hz: Tensor
@@ -91,7 +91,7 @@ class SpeedTuning(NamedTuple):
 
 
 def draw_tuning(config: SpeedCellConfig, draw: torch.Generator) -> SpeedTuning:
-    """Draw each cell's tuning evenly from the bands of the config."""
+    """Draw the tuning of each cell uniformly from the ranges of the config."""
     share = torch.rand(3, config.n, generator=draw, dtype=torch.float64)
     bands = torch.tensor([config.rest_hz, config.top_hz, config.lead_s], dtype=torch.float64)
     rest, top, lead = bands[:, :1] + (bands[:, 1:] - bands[:, :1]) * share
@@ -101,12 +101,12 @@ def draw_tuning(config: SpeedCellConfig, draw: torch.Generator) -> SpeedTuning:
 def acceleration(
     smoothed_m_s: Tensor, speed_m_s: Tensor, smooth_s: float, dt_s: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Measure acceleration by how far speed is from its own running mean.
+    r"""Estimate acceleration from the deviation of speed from its running mean.
 
     .. math:: q = e^{-dt/\tau}, \qquad \dot v \approx (v - \bar v)\,\frac{1 - q}{dt}, \qquad
               \bar v \leftarrow v + q\,(\bar v - v)
 
-    Of a speed that rises steadily it is the rise, at any time step.
+    For a steadily rising speed it is exact at any time step.
 
     Args:
         smoothed_m_s: :math:`\bar v`, shape ``(...,)``.
@@ -125,7 +125,7 @@ def acceleration(
 def speed_rates(
     speed_m_s: Tensor, acceleration_m_s2: Tensor, tuning: SpeedTuning, max_speed_m_s: float
 ) -> Tensor:
-    r"""Respond linearly to the speed that is to be expected.
+    r"""Return rates that are linear in the anticipated speed.
 
     .. math:: r_c = b_c + a_c \, \min(\max(v + \ell_c \dot v,\, 0),\, v_\text{max})
 
@@ -148,12 +148,12 @@ def speed_rates(
 
 
 def fit_readout(tuning: SpeedTuning, max_speed_m_s: float) -> Tensor:
-    r"""Fit the weights that read a speed from the rates, by least squares.
+    r"""Fit the weights that decode speed from rates, by least squares.
 
     .. math:: w = \arg\min_w \sum_v \Big(\sum_c w_c\, r_c(v) - v\Big)^2
 
-    of which there are many, for the rates have two degrees of freedom; the smallest averages the
-    noise of the cells best.
+    which is not unique, as the rates have two degrees of freedom; the solution of least norm
+    averages the cells' noise best.
 
     Returns:
         Shape ``(n,)``, in m/s for a Hz.
@@ -164,7 +164,7 @@ def fit_readout(tuning: SpeedTuning, max_speed_m_s: float) -> Tensor:
 
 
 def decode_speed(rates_hz: Tensor, readout: Tensor) -> Tensor:
-    r"""Read the speed from the rates: :math:`\hat v = \sum_c w_c r_c`, shape ``(...,)``."""
+    r"""Decode the speed from the rates: :math:`\hat v = \sum_c w_c r_c`, shape ``(...,)``."""
     return rates_hz @ readout
 
 
@@ -193,13 +193,13 @@ def speed_score(rates_hz: np.ndarray, speed_m_s: np.ndarray) -> np.ndarray:
 
 @register("speed")
 class SpeedCells(Population):
-    """Linear rates of running speed, and the speed read from them; :func:`speed_rates` says how.
+    """Linear rates of running speed, and the speed decoded from them; see :func:`speed_rates`.
 
     The tuning is drawn from ``config.seed`` and is part of the state, as is the generator of the
-    noise: a population that is saved, loaded and goes on is bit-equal to one that never stopped.
+    noise: a population that is saved, loaded and continued is bit-equal to one that was not.
 
     Args:
-        config: Bands of the tuning, and the noise.
+        config: Ranges of the tuning, and the noise.
         batch: Number of animals side by side, all with the same tuning; ``None`` for one.
 
     Example:
@@ -246,13 +246,13 @@ class SpeedCells(Population):
 
     @property
     def speed_m_s(self) -> float | Tensor:
-        """Speed that the rates tell, in m/s; in a batch ``(batch,)``."""
+        """Speed decoded from the rates, in m/s; in a batch ``(batch,)``."""
         speed = decode_speed(self.rates_hz, self.readout)
         return speed.item() if self.batch is None else speed
 
     @without_gradients
     def advance(self, motion: Motion) -> None:
-        """Respond to self-motion; backward is running too.
+        """Update the rates by self-motion; backward motion counts as running.
 
         Args:
             motion: Speed in m/s (in a batch ``(batch,)``) for how many seconds.
@@ -271,7 +271,7 @@ class SpeedCells(Population):
         self.smoothed_m_s, self.rates_hz = smoothed, rates
 
     def forward(self, motion: Motion) -> float | Tensor:
-        """Advance one frame and return the speed that the rates tell."""
+        """Advance one frame and return the decoded speed."""
         self.advance(motion)
         return self.speed_m_s
 
@@ -287,7 +287,7 @@ class SpeedCells(Population):
         self.readout = self.readout.to(self.rates_hz)
         return self
 
-    # ------------------------------------------------------- its part in a brain of populations
+    # ------------------------------------------------------- protocol of a population
 
     def step(self, now: StepInput, observation: None) -> None:
         """Advance by a frame of the brain."""
@@ -299,11 +299,11 @@ class SpeedCells(Population):
         return self.rates_hz.numpy(force=True)
 
     def counts(self) -> dict[str, float]:
-        """Return how many cells there are."""
+        """Return the number of cells."""
         return {"speed_cells": self.config.n}
 
     def scalars(self) -> dict[str, float]:
-        """Return the speed that is decoded, and the mean rate."""
+        """Return the decoded speed, and the mean rate."""
         if self.batch is not None:
             return {}
         return {"speed/speed_m_s": self.speed_m_s, "speed/rate_hz": self.rates_hz.mean().item()}
@@ -316,7 +316,7 @@ class SpeedCells(Population):
     def faults(
         cls, state: Mapping[str, np.ndarray], config: BrainConfig, n_views: int, n_experiences: int
     ) -> Iterator[str]:
-        """Say where a rate or a slope is negative."""
+        """Yield rates, slopes and times that are negative."""
         for name in ("rates_hz", "smoothed_m_s", "rest_hz", "slope_hz_s_m", "lead_s"):
             if (state[name] < 0).any():
                 yield f"speed.{name}: negative"

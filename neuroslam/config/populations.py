@@ -105,7 +105,9 @@ def load_plugin(path: str | Path) -> None:
                 f"plugin {path}: registers no population; decorate one with @register"
             )
     except BaseException as error:
-        registered.clear()
+        # What it has imported of the package stays: a module registers once.
+        for kind in registered.keys() - before.keys() - HOMES.keys():
+            del registered[kind]
         registered.update(before)
         if loaded is None:
             del _loaded[str(file)], sys.modules[spec.name]

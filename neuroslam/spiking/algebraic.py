@@ -1,4 +1,4 @@
-"""The same path integrator and map in vectors alone: what the neurons approximate."""
+"""Path integrator and map as vectors without neurons: what the neurons approximate."""
 
 import math
 
@@ -12,15 +12,15 @@ from neuroslam.state.mergeable import BufferModule
 
 
 class AlgebraicIntegrator(Packet):
-    r"""Keeps a position as phases that the velocity turns.
+    r"""Represents a position by phases that the velocity advances.
 
     .. math:: z_k \leftarrow z_k\, e^{i (a_k \cdot v\,\Delta t + \sigma \sqrt{\Delta t}\,\xi_k)}
 
     State: ``phasor``, ``position_m``, and the generator of the noise.
 
     Args:
-        space: Of the positions.
-        config: Noise, coupling, how fast corrections act.
+        space: Space of the positions.
+        config: Noise, coupling, time constant of corrections.
         time_step_s: Length of a step.
         seed: Of the noise.
         batch: Animals side by side; each has its own noise.
@@ -60,18 +60,18 @@ class AlgebraicIntegrator(Packet):
 
     @property
     def n_neurons(self) -> int:
-        """None."""
+        """Number of neurons: none."""
         return 0
 
     @torch.no_grad()
     def start(self, position_m: Tensor) -> None:
-        """Put the phases where an animal is, ``(batch, dimension)``."""
+        """Set the phases to a position, ``(batch, dimension)``."""
         z = self.space.encode_fourier(position_m.to(self.position_m))
         self.phasor = torch.view_as_real(z).clone()
         self._place(position_m)
 
     def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
-        """Move on by one step; arguments as those of the neurons' integrator."""
+        """Advance one step; arguments as for :class:`~.path_integrator.PathIntegrator`."""
         c, dt = self.config, self.time_step_s
         turn = (velocity_m_s * dt) @ self.space.wave_vectors.T
         if c.phase_noise_rad > 0:
@@ -89,7 +89,7 @@ class AlgebraicIntegrator(Packet):
 
 
 class AlgebraicMap(BufferModule):
-    r"""Learns which vector belongs to which key, as one matrix and by the delta rule.
+    r"""Associates vectors with keys by one matrix and the delta rule.
 
     .. math:: W \leftarrow W + \kappa\,\Delta t\,(v - W k)\, k^\top / |k|^2
 
@@ -128,13 +128,13 @@ class AlgebraicMap(BufferModule):
 
     @property
     def n_neurons(self) -> int:
-        """None."""
+        """Number of neurons: none."""
         return 0
 
     def forward(
         self, key: Tensor, value: Tensor, seen: Tensor, plasticity: Tensor | None = None
     ) -> Tensor:
-        """Recall a key's value and learn; arguments as those of the neurons' map."""
+        """Recall a key's value and learn; see :class:`~.associative.AssociativeMap`."""
         recall = torch.bmm(key.unsqueeze(1), self.weights.mT).squeeze(1)
         rate = seen * (1.0 - math.exp(-self.config.learning_rate_s * self.time_step_s))
         rate = rate if plasticity is None else rate * plasticity
@@ -145,11 +145,11 @@ class AlgebraicMap(BufferModule):
 
     @torch.no_grad()
     def read(self, keys: Tensor) -> Tensor:
-        """Return what is recalled, ``(n, n_key)`` to ``(batch, n, n_value)``."""
+        """Return the recall of keys, ``(n, n_key)`` to ``(batch, n, n_value)``."""
         return self.respond(keys) @ self.weights.mT
 
     def respond(self, keys: Tensor) -> Tensor:
-        """Return the keys themselves, for every animal: what the memory's cells stand for."""
+        """Return the keys for every animal, in place of rates of neurons."""
         return keys.to(self.weights).expand(len(self.weights), -1, -1)
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""The semantic map: an associative memory, in neurons, from what is seen to where it is."""
+"""The semantic map: an associative memory in neurons from landmarks to positions."""
 
 import torch
 from torch import Tensor
@@ -24,15 +24,15 @@ _INHIBITION = 25.0  # of the error's neurons, where nothing is to be learnt
 
 
 class AssociativeMap(BufferModule):
-    """Learns which vector belongs to which key: places of landmarks, by their pointers.
+    """Associates vectors with keys: positions of landmarks with their pointers.
 
     A population fires to keys; the weights with which it recalls learn from the error
     (:func:`~neuroslam.spiking.learning.pes_step`), its encoders move to the keys that it meets
-    (:func:`~neuroslam.spiking.learning.voja_step`). The error is said by a population of its own,
-    which is silenced where nothing is to be learnt. What is recalled may pass through one more
+    (:func:`~neuroslam.spiking.learning.voja_step`). A further population represents the
+    error and is silenced where nothing is to be learnt. The recall may pass through one more
     (``relay`` in the config).
 
-    State: all of it, learnt weights of every animal among it, ``encoders`` ``(batch, neurons,
+    State: all of it, with the learnt weights of every animal, ``encoders`` ``(batch, neurons,
     key)`` and ``decoders`` ``(batch, neurons, value)``.
 
     Args:
@@ -43,7 +43,7 @@ class AssociativeMap(BufferModule):
         time_step_s: Length of a step.
         seed: Of the neurons.
         batch: Animals side by side.
-        keys: Known in advance, ``(n, n_key)``: encoders begin there; ``None``: anywhere.
+        keys: Keys known in advance, ``(n, n_key)``, as initial encoders; ``None``: random.
 
     Example:
         >>> key, place = torch.eye(8)[:1], torch.eye(8)[6:7]
@@ -55,6 +55,9 @@ class AssociativeMap(BufferModule):
         6
     """
 
+    memory: NeuronArray
+    error: NeuronArray
+    relay: NeuronArray
     encoders: Tensor
     decoders: Tensor
     gain: Tensor
@@ -117,13 +120,13 @@ class AssociativeMap(BufferModule):
             voja: How much encoders learn, ``(batch,)``; ``None``: as ``seen``.
 
         Returns:
-            What is recalled, filtered, ``(batch, n_value)``.
+            The recall, filtered, ``(batch, n_value)``.
         """
         c, dt = self.config, self.time_step_s
-        # In this order, as the other way round takes seven times as long.
+        # In this order; the other one takes seven times as long.
         current = self.memory.bias + torch.bmm(key.unsqueeze(1), self.encoders.mT).squeeze(1)
         spikes = self.memory.fire((self.memory.charged * (1.0 - current)).unsqueeze(0))[0]
-        said = self.error_said(seen)
+        error_now = self.error_output(seen)
         passed = self.recalled
         if c.relay:
             passed = self.relay(passed.unsqueeze(0))[0] @ self.relay_decoders[0]
@@ -140,24 +143,24 @@ class AssociativeMap(BufferModule):
         self.relayed = lowpass(self.relayed, passed, kept)
         self.recalled = lowpass(self.recalled, decoded, synapse(_TAU_RECALL_S, dt))
         self.taught = lowpass(self.taught, value, synapse(_TAU_TEACHER_S, dt))
-        self.rule = lowpass(self.rule, said, kept)
+        self.rule = lowpass(self.rule, error_now, kept)
         return self.recalled
 
-    def error_said(self, seen: Tensor) -> Tensor:
-        """Step the error's neurons, ``(batch,)`` in, and return what they say, raw."""
+    def error_output(self, seen: Tensor) -> Tensor:
+        """Step the neurons of the error; return their unfiltered output, ``(batch, n_value)``."""
         current = self.error.currents((self.relayed - self.taught).unsqueeze(0))
         missing = 1.0 - current + _INHIBITION * (1.0 - seen).unsqueeze(-1)
         return self.error.fire(self.error.charged * missing)[0] @ self.error_decoders[0]
 
     @property
     def n_neurons(self) -> int:
-        """Of one animal, in all populations."""
+        """Number of neurons of one animal, in all populations."""
         parts = [self.memory, self.error] + ([self.relay] if self.config.relay else [])
         return sum(part.n_neurons for part in parts)
 
     @torch.no_grad()
     def read(self, keys: Tensor) -> Tensor:
-        """Return what would be recalled at rest, nothing learnt or stepped.
+        """Return the recall at rest, without learning or stepping.
 
         Args:
             keys: ``(n, n_key)``.
@@ -174,11 +177,11 @@ class AssociativeMap(BufferModule):
 
     @torch.no_grad()
     def write(self, keys: Tensor, values: Tensor) -> None:
-        r"""Make keys recall values, and forget what was recalled before; of all animals.
+        r"""Make keys recall values, and forget earlier ones, for all animals.
 
         .. math:: D = A^\top (A A^\top)^{-1} V
 
-        with the rates :math:`A` to the keys: the smallest weights that do it.
+        with the rates :math:`A` to the keys: the weights of least norm.
 
         Args:
             keys: ``(n, n_key)``.

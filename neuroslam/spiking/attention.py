@@ -1,4 +1,4 @@
-"""What of the landmarks in view is attended to, and as which vectors it is seen."""
+"""Attention: which landmarks in view are used, and the vectors that represent them."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ SEVERAL = -2
 
 
 class Sight(NamedTuple):
-    """What is seen over some steps.
+    """Attended landmarks over some steps.
 
     Attributes:
         key: Pointers of what is attended to, summed, ``(steps, batch, n_features)``; 0 where
@@ -60,7 +60,7 @@ def attend(in_view: Tensor, distance_m: Tensor, time_s: Tensor, turn_s: float, h
 
 
 def held(attended: Tensor, before: Tensor, held_s: Tensor, time_step_s: float) -> Tensor:
-    """Return for how long the same has been attended to, at each step.
+    """Return for how long the same landmark has been attended to, at each step.
 
     Args:
         attended: ``(steps, batch)``.

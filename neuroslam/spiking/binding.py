@@ -11,7 +11,7 @@ from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 1000
 _RADIUS = math.sqrt(2.0)  # of a sum or difference of two numbers of at most 1, over root 2
-TAU_S = 0.03  # noise of few neurons; who compares with it waits as long
+TAU_S = 0.03  # filters noise of few neurons; signals compared with it need the same delay
 
 
 class SpikingBinding(BufferModule):

@@ -1,4 +1,4 @@
-"""The gate in neurons: no function is computed outside of them, as a chip asks for."""
+"""The gate in neurons: no function is computed outside of them, as on a chip."""
 
 import torch
 from torch import Tensor
@@ -16,13 +16,13 @@ _OUT_S = 0.1  # noise of few neurons stays out of the path integrator
 
 
 class SpikingCorrection(BufferModule):
-    r"""Says by how much the map disagrees, unless a population objects.
+    r"""Represents the disagreement of the map with the position, unless a population vetoes it.
 
     One population holds the difference of two vectors; another fires where their similarity is
     below the gate, or nothing is seen, and silences it (the variant for Loihi of the reference).
     The similarity is the sum of products in populations that square.
 
-    State: that of the populations and what they have said, ``difference`` ``(batch,
+    State: that of the populations and their outputs, ``difference`` ``(batch,
     n_frequencies, 2)``, ``alike`` and ``veto`` ``(batch,)``.
 
     Args:
@@ -37,13 +37,13 @@ class SpikingCorrection(BufferModule):
 
     Example:
         >>> gate = SpikingCorrection(4, 400, 50, 0.2, NeuronConfig(), time_step_s=1e-3)
-        >>> here, told = torch.ones(1, 4) + 0j, torch.ones(1, 4) + 0.3j
+        >>> here, implied = torch.ones(1, 4) + 0j, torch.ones(1, 4) + 0.3j
         >>> for _ in range(500):
-        ...     pull = gate(told, here, torch.ones(1))
+        ...     pull = gate(implied, here, torch.ones(1))
         >>> bool((pull - 0.3j).abs().mean() < 0.15)
         True
         >>> for _ in range(500):
-        ...     pull = gate(told, here, torch.zeros(1))
+        ...     pull = gate(implied, here, torch.zeros(1))
         >>> bool(pull.abs().max() < 0.02)
         True
     """
@@ -98,23 +98,23 @@ class SpikingCorrection(BufferModule):
         """Of one animal."""
         return self.neurons.n_neurons + self.products.n_neurons + self.objecting.n_neurons
 
-    def forward(self, told: Tensor, here: Tensor, seen: Tensor) -> Tensor:
+    def forward(self, implied: Tensor, here: Tensor, seen: Tensor) -> Tensor:
         """Step, and return the correction, complex, ``(batch, n_frequencies)``.
 
         Args:
-            told: Where the map says that the animal is, complex.
-            here: Where it believes to be.
+            implied: Position that the map implies, complex.
+            here: Estimated position.
             seen: 1 where something is in view, ``(batch,)``.
         """
         dt = self.time_step_s
-        apart = torch.view_as_real(told - here).flatten(-2)
+        apart = torch.view_as_real(implied - here).flatten(-2)
         missing = 1.0 - self.neurons.currents(apart.unsqueeze(0))
         missing = missing + _VETO * self.veto.clamp_min(0.0).unsqueeze(-1)
         fired = self.neurons.fire(self.neurons.charged * missing)[0]
         said = (fired @ self.decoders[0]).reshape(self.difference.shape)
         against = 1.0 - self.alike + (1.0 - seen)
         objects = self.objecting(against.reshape(1, -1, 1))[0] @ self.veto_decoders[0]
-        self.alike = self.products(told, here.conj()).real.mean(-1)
+        self.alike = self.products(implied, here.conj()).real.mean(-1)
         self.veto = lowpass(self.veto, objects.squeeze(-1), synapse(_TAU_S, dt))
         self.difference = lowpass(self.difference, said, synapse(_OUT_S, dt))
         return torch.view_as_complex(self.difference)

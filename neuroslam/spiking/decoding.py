@@ -1,4 +1,4 @@
-"""From vectors back to positions: search and refinement, a trained network, a probability."""
+"""Decoding of positions from vectors: search and refinement, a network, a probability."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -9,15 +9,15 @@ from torch import Tensor, nn
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.space import SSPSpace
 
-_STEP_RAD = 1.25  # of the shortest wave, between two points of the coarse search
+_STEP_RAD = 1.25  # phase of the shortest wave between two points of the coarse search
 _MOST_POINTS = 20_000
 _CANDIDATES = 4
 _REFINEMENTS = 6
-_LEAST_CURVATURE = 0.02  # share of a whole wave's, that a wave which disagrees still counts for
+_LEAST_CURVATURE = 0.02  # least curvature of a wave, as a share of one in phase
 
 
 class Decoded(NamedTuple):
-    """A position, and how much a vector is like that of it.
+    """A decoded position, and the similarity of its vector.
 
     Attributes:
         position_m: ``(..., dimension)``.
@@ -36,12 +36,12 @@ def agreement(space: SSPSpace, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class PositionDecoder:
-    r"""Finds the position whose vector is most like a given one.
+    r"""Finds the position whose vector is most similar to a given one.
 
     .. math:: \hat x = \arg\max_x s(x), \qquad
               s(x) = \frac1K \sum_k \mathrm{Re}\bigl(z_k e^{-i a_k \cdot x}\bigr)
 
-    A coarse search, as fine as the shortest wave asks for, then Newton's method from the best few.
+    A coarse search at the resolution of the shortest wave, then Newton's method from the best few.
     It is the estimate of the paper (argmax of :math:`\phi(x) \cdot \hat\phi`) without a grid's
     error, 0.0077 for 100 points a side.
 
@@ -116,7 +116,7 @@ class PositionDecoder:
         return torch.clamp(position, low, high)
 
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Points of the coarse search and the waves at them; made anew if the space changed."""
+        """Return the points of the coarse search and the waves at them; renewed with the space."""
         waves = self.space.wave_vectors.detach()
         known = self._waves
         if known is None or known.device != waves.device or not torch.equal(known, waves):
@@ -134,7 +134,7 @@ class PositionDecoder:
 
 
 class LearnedDecoder(nn.Module):
-    """A small network that reads positions out of vectors; trained on the space itself.
+    """A small network that decodes positions from vectors; trained on the space.
 
     Args:
         space: Of the positions.
@@ -149,6 +149,9 @@ class LearnedDecoder(nn.Module):
         >>> decoder(space.encode(torch.zeros(3, 2))).shape
         torch.Size([3, 2])
     """
+
+    low_m: Tensor
+    high_m: Tensor
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Populations of neurons that say vectors: tuning, decoders, synapses (the NEF's principles)."""
+"""Populations of neurons that represent vectors: tuning, decoders, synapses (NEF)."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from neuroslam.state.mergeable import BufferModule
 
 
 class Tuning(NamedTuple):
-    r"""What neurons respond to: :math:`J = \alpha\,e \cdot x / r + \beta`.
+    r"""Tuning of neurons: :math:`J = \alpha\,e \cdot x / r + \beta`.
 
     Attributes:
         encoders: :math:`e`, unit vectors, ``(groups, neurons, dimensions)``.
@@ -101,7 +101,7 @@ def rates(current: Tensor, config: NeuronConfig, time_step_s: float = 1e-3) -> T
 
 
 def solve_decoders(activity: Tensor, targets: Tensor, noise: float = 0.1) -> Tensor:
-    r"""Solve for the weights that read a function out of rates, robust to noise in them.
+    r"""Solve for the weights that decode a function from rates, robust to noise.
 
     .. math:: D = (A^\top A + n \sigma^2 I)^{-1} A^\top Y
 
@@ -129,7 +129,7 @@ def solve_decoders(activity: Tensor, targets: Tensor, noise: float = 0.1) -> Ten
 
 
 def synapse(tau_s: float, time_step_s: float) -> float:
-    r"""Return what a lowpass keeps over a step, :math:`e^{-\Delta t/\tau}`; 0 without one."""
+    r"""Return the decay of a lowpass over a step, :math:`e^{-\Delta t/\tau}`; 0 without one."""
     return math.exp(-time_step_s / tau_s) if tau_s > 0 else 0.0
 
 
@@ -144,7 +144,7 @@ class NeuronArray(BufferModule):
     :func:`neuroslam.spiking.neurons.lif_step` has the mathematics. Groups lead and animals come
     second, so that one batched matrix product serves all of them. State: ``weights`` (encoders with
     gain), ``bias``, and what each neuron carries, ``deficit`` and ``asleep``. What fired in the
-    last step is in ``spikes``, for who watches.
+    last step are in ``spikes``, for recorders.
 
     Args:
         tuning: What the neurons respond to.
@@ -190,12 +190,12 @@ class NeuronArray(BufferModule):
 
     @property
     def charged(self) -> float:
-        """Share of the way to its current that a voltage goes in a step."""
+        """Share by which a voltage approaches its current in a step."""
         return 1.0 - self.membrane.keeps(self.time_step_s)
 
     @property
     def n_neurons(self) -> int:
-        """In all groups together, of one animal."""
+        """Number of neurons of one animal, in all groups."""
         return self.bias.numel()
 
     def currents(self, x: Tensor) -> Tensor:
@@ -241,6 +241,6 @@ class NeuronArray(BufferModule):
         return fired
 
     def silence(self) -> None:
-        """Put all neurons to rest, at their thresholds' distance 1."""
+        """Reset all neurons to rest, at distance 1 from threshold."""
         self.deficit = torch.ones_like(self.deficit)
         self.asleep = torch.zeros_like(self.asleep)

@@ -1,4 +1,4 @@
-"""Two semantic maps become one: read out, laid on each other by what both know, written anew."""
+"""Merge of two semantic maps: decoded, aligned by shared landmarks, written to one memory."""
 
 from typing import NamedTuple
 
@@ -9,17 +9,17 @@ from neuroslam.errors import SpaceError
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.slam import SSPSLAM
 
-_KNOWN = 0.5  # strength of a recall from which a landmark is known
+_KNOWN = 0.5  # strength of recall above which a landmark is known
 
 
 class SemanticMergeReport(NamedTuple):
-    """How two semantic maps were joined, or why not.
+    """Report of the merge of two semantic maps.
 
     Attributes:
         joined: Whether they were.
         reason: In one line.
         offset_m: What the partial map was moved by.
-        agree: Landmarks by which it was laid on the other.
+        agree: Landmarks by which the maps were aligned.
         moved: Known to both, but elsewhere; the partial map, which is younger, is believed.
         added: Known to the partial map alone.
         kept: Known to the loaded map alone.
@@ -39,9 +39,9 @@ class SemanticMergeReport(NamedTuple):
 def merge_semantic_maps(
     loaded: SSPSLAM, partial: SSPSLAM, confirm: int = 2, tolerance_m: float = 0.1
 ) -> tuple[SSPSLAM | None, SemanticMergeReport]:
-    r"""Join the map of a session to one that was loaded; neither is altered.
+    r"""Merge the map of a session into a loaded one; neither is altered.
 
-    The vectors of a landmark in both maps, unbound, say how the maps lie:
+    The vectors of a landmark in both maps, unbound, give the offset of the maps:
     :math:`\hat\phi_l(x_i) \circledast \hat\phi_p(x_i)^{-1} \approx \phi(\Delta)`, points and
     regions alike. Most landmarks must agree on :math:`\Delta`. All of the partial map is moved by
     it, and both are written into one memory. The session that goes on is the partial one.
@@ -72,7 +72,7 @@ def merge_semantic_maps(
     chosen = apart[int(votes.argmax())] <= tolerance_m
     if int(chosen.sum()) < max(confirm, len(both) // 2 + 1):
         said = (
-            f"{int(chosen.sum())} of {len(both)} shared landmarks agree on how the maps lie, "
+            f"{int(chosen.sum())} of {len(both)} shared landmarks agree on the offset of the maps, "
             f"{max(confirm, len(both) // 2 + 1)} must; the others are elsewhere"
         )
         return None, SemanticMergeReport(False, said)
@@ -125,7 +125,7 @@ def _same_kind(loaded: SSPSLAM, partial: SSPSLAM) -> None:
 
 
 def _known(slam: SSPSLAM) -> dict[str, Tensor]:
-    """What is recalled for each landmark that is known, by name, as Fourier coefficients."""
+    """Return the recall of each known landmark, by name, as Fourier coefficients."""
     z = slam.space.to_fourier(slam.map.read(slam.pointers)[0])
     strength = z.abs().square().mean(-1).sqrt()
     return {name: z[k] / strength[k] for k, name in enumerate(slam.names) if strength[k] > _KNOWN}
@@ -134,7 +134,7 @@ def _known(slam: SSPSLAM) -> dict[str, Tensor]:
 def _written(
     loaded: SSPSLAM, partial: SSPSLAM, known: dict[str, Tensor], offset_m: Tensor
 ) -> SSPSLAM:
-    """Make the merged map: the partial one's session goes on in the frame of the loaded one."""
+    """Make the merged map, which continues the partial session in the loaded frame."""
     pointers = dict(zip(loaded.names, loaded.pointers, strict=True))
     for name, pointer in zip(partial.names, partial.pointers, strict=True):
         pointers.setdefault(name, pointer)

@@ -1,4 +1,4 @@
-"""How the frames lie in which places of landmarks are told: of experiences, of two sessions."""
+"""Frames of landmark positions: those of experiences, and the alignment of two sessions."""
 
 import math
 from collections.abc import Callable
@@ -22,12 +22,12 @@ def into_frame(pose: np.ndarray, point_m: np.ndarray) -> np.ndarray:
 
 
 def from_frame(poses: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """Undo :func:`into_frame`, for many: ``(n, 3)`` and ``(n, 2)``."""
+    """Invert :func:`into_frame` for ``(n, 3)`` poses and ``(n, 2)`` points."""
     return poses[:, :2] + rotated(points_m, poses[:, 2])
 
 
 def rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
-    """Turn points about the origin, ``(..., 2)``."""
+    """Rotate points about the origin, ``(..., 2)``."""
     c, s = np.cos(by_rad), np.sin(by_rad)
     x, y = points_m[..., 0], points_m[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
@@ -36,14 +36,14 @@ def rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
 def shared_frames(
     loaded: State, partial: State, confirm: int = 2, same_m: float = 1.0
 ) -> tuple[Pose, Pose] | None:
-    """Say how two semantic maps lie by the named landmarks that both know.
+    """Align two semantic maps by the named landmarks that both know.
 
-    The largest group of them that one turn and one shift bring together within ``same_m`` is
-    believed.
+    The alignment is that of the largest group which one rotation and one shift bring together
+    within ``same_m``.
 
     Returns:
-        A pose in the partial map's frame, and the same in the loaded one's; ``None`` where fewer
-        than ``confirm`` agree, or no more than those that do not.
+        A pose in the partial map's frame, and the same in the loaded one's; ``None`` if fewer
+        than ``confirm`` landmarks agree, or not more than half.
     """
     tables = [
         {
@@ -64,7 +64,7 @@ def shared_frames(
     for i, j in combinations(range(len(both)), 2):
         if np.linalg.norm(start[i] - start[j]) < same_m:
             continue
-        fit = _laid(start[[i, j]], onto[[i, j]])
+        fit = _alignment(start[[i, j]], onto[[i, j]])
         near = np.linalg.norm(fit(start) - onto, axis=1) <= same_m
         if best is None or near.sum() > best.sum():
             best = near
@@ -75,14 +75,14 @@ def shared_frames(
 
 
 def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:
-    """Turn of one set of points that fits it best to another, least squares."""
+    """Return the rotation that fits one set of points to another best, least squares."""
     a, b = start_m - start_m.mean(0), onto_m - onto_m.mean(0)
     across = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     return math.atan2(across.sum(), (a * b).sum())
 
 
-def _laid(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def _alignment(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     turn = _turn_between(start_m, onto_m)
     c, s = math.cos(turn), math.sin(turn)
-    way = np.array([[c, s], [-s, c]])
-    return lambda points: (points - start_m.mean(0)) @ way + onto_m.mean(0)
+    rotation = np.array([[c, s], [-s, c]])
+    return lambda points: (points - start_m.mean(0)) @ rotation + onto_m.mean(0)

@@ -13,7 +13,7 @@ from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
 
 Columns = dict[str, np.ndarray]
-"""Of the landmarks that count, by name: kind, number, experience, place_m."""
+"""Columns of confirmed landmarks, by name: kind, number, experience, place_m."""
 
 
 def match_landmarks(
@@ -22,7 +22,7 @@ def match_landmarks(
     maps: tuple[np.ndarray, np.ndarray],
     config: BrainConfig,
 ) -> tuple[Match | None, str]:
-    """Align the landmarks that two sessions know by name.
+    """Find the alignment of two maps by the named landmarks of both sessions.
 
     Args:
         states: Of the semantic cells of the loaded session and of the partial one.
@@ -31,7 +31,7 @@ def match_landmarks(
         config: Of both.
 
     Returns:
-        Where the maps meet, or ``None``; and how that was found, or why not, for a reader.
+        The match, or ``None``; and a sentence on how it was found, or why not.
     """
     places = [_experiences_by_name(columns) for columns in known]
     both = sorted(places[0].keys() & places[1].keys())
@@ -70,7 +70,7 @@ def match_landmarks(
 
 
 def _experiences_by_name(known: Columns) -> dict[int, tuple[int, np.ndarray]]:
-    """Experience and position of each named landmark that is an experience of the map."""
+    """Return experience and position of each named landmark that is an experience."""
     rows = (known["kind"] == NAMED) & (known["experience"] >= 0)
     each = zip(known["number"][rows].tolist(), known["experience"][rows].tolist(),
                known["place_m"][rows], strict=True)  # fmt: skip

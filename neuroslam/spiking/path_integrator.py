@@ -14,13 +14,13 @@ from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
-_LOOK_S = 0.004  # between two looks at the packet
-_REREAD_STEPS = 100  # between two looks at the whole space for where the packet is
-_CLEARLY_BETTER = 0.05  # in similarity, where a packet elsewhere is believed
+_LOOK_S = 0.004  # time between two decodings of the position
+_REREAD_STEPS = 100  # steps between two decodings over the whole space
+_CLEARLY_BETTER = 0.05  # excess of similarity at which another position is taken
 
 
 def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilise: float) -> Tensor:
-    r"""Return what an oscillator tells itself, through a synapse, to go round.
+    r"""Return the recurrent input by which an oscillator rotates, through a synapse.
 
     .. math:: z \leftarrow z + \tau\Bigl(i \omega z + \lambda \frac{1 - r^2}{r} z\Bigr)
 
@@ -39,7 +39,7 @@ def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilis
 
 
 def module_pull(z: Tensor, modules: Tensor) -> Tensor:
-    r"""Return by how much the phases of each module should turn for their sum to be zero.
+    r"""Return the change of each module's phases that makes their sum zero.
 
     The waves of a module close, :math:`\sum_j a_j = 0`, so their phases sum to zero wherever the
     animal is. Each takes its share of what is missing.
@@ -69,7 +69,7 @@ def coupled(
     space: SSPSpace,
     config: PathIntegratorConfig,
 ) -> Tensor | None:
-    """Add to a correction the pull of the oscillators on each other.
+    """Add the coupling of the oscillators to a correction.
 
     Args:
         z: Fourier coefficients, complex, ``(batch, n_frequencies)``.
@@ -90,7 +90,7 @@ def coupled(
 
 
 class Packet(BufferModule):
-    """What both kinds of path integrator share: where the packet of their phases is.
+    """Base of both path integrators: the position that the phases encode.
 
     State: ``position_m`` ``(batch, dimension)``, ``age`` in steps, and the space's parameters.
 
@@ -123,10 +123,10 @@ class Packet(BufferModule):
         self.age = torch.zeros_like(self.age)
 
     def locate(self, velocity_m_s: Tensor) -> Tensor:
-        """Follow the packet to where it is now, and return its Fourier coefficients.
+        """Track the position that the phases encode, and return the Fourier coefficients.
 
-        It is looked at every few steps; in between the velocity says where it goes. Now and then
-        the whole space is searched, so that a packet that jumped is found.
+        It is decoded every few steps near the last position, and integrated in between. At longer
+        intervals it is decoded over the whole space, so that a jump is found.
         """
         z = self.z
         position = self.position_m + self.time_step_s * velocity_m_s
@@ -143,11 +143,11 @@ class Packet(BufferModule):
 
 
 class PathIntegrator(Packet):
-    """Keeps a position as phases of oscillators, whose rates the velocity sets.
+    """Represents a position by phases of oscillators whose frequency the velocity sets.
 
     :func:`oscillator_dynamics` has the mathematics. Each oscillator is a population of neurons for
     three numbers: a point of the unit circle and its rate, as a share of the rate at the highest
-    speed. Decoders are solved for points near the circle, where oscillators live.
+    speed. Decoders are solved for amplitudes near the unit circle.
 
     State: the neurons' (``neurons``), and ``recurrent``, ``external``, ``output``,
     ``position_m``; parameters of the space are its own and part of the state as well.
@@ -201,7 +201,7 @@ class PathIntegrator(Packet):
 
     @property
     def n_neurons(self) -> int:
-        """In all oscillators of one animal."""
+        """Number of neurons of one animal, in all oscillators."""
         return self.neurons.n_neurons
 
     def _solve(self, draw: torch.Generator) -> Tensor:
@@ -231,7 +231,7 @@ class PathIntegrator(Packet):
 
     @torch.no_grad()
     def start(self, position_m: Tensor) -> None:
-        """Put the oscillators where an animal is, ``(batch, dimension)``.
+        """Set the oscillators to a position, ``(batch, dimension)``.
 
         The neurons' voltages are left as they are; they settle within a few milliseconds.
         """
@@ -242,7 +242,7 @@ class PathIntegrator(Packet):
         self._place(position_m)
 
     def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
-        r"""Move on by one step.
+        r"""Advance one step.
 
         Args:
             velocity_m_s: ``(batch, dimension)``.
@@ -260,7 +260,7 @@ class PathIntegrator(Packet):
         return self.locate(velocity_m_s)
 
     def drive(self, share: Tensor, pull: Tensor | None) -> None:
-        """Move the oscillators on by one step, in their own terms.
+        """Advance the oscillators one step, in terms of their phases.
 
         Args:
             share: Rate of each oscillator over its highest, ``(n_frequencies, batch)``.

@@ -10,11 +10,11 @@ from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
 TAU_S = 0.01
-_INTERCEPTS = (0.1, 0.9)  # similarity to its own place at which a cell begins to fire
+_INTERCEPTS = (0.1, 0.9)  # similarity to its preferred vector above which a cell fires
 
 
 class VectorPopulation(BufferModule):
-    r"""Says an SSP with cells that each like one: ``φ(p)``, or the part of it that a module has.
+    r"""Represents an SSP by cells tuned to one each: ``φ(p)``, or its part in a module.
 
     .. math:: J_i = \alpha_i\, e_i \cdot \phi + \beta_i
 
@@ -27,7 +27,7 @@ class VectorPopulation(BufferModule):
 
     Args:
         encoders: As Fourier coefficients, complex, ``(neurons, n_frequencies)``.
-        region_m: Where the vectors lie, ``(dimension, 2)``.
+        region_m: Bounds of the vectors, ``(dimension, 2)``.
         space: Of the vectors.
         config: Model of the neurons.
         time_step_s: Length of a step.
@@ -76,7 +76,7 @@ class VectorPopulation(BufferModule):
         batch: int = 1,
         reach_m: float = 0.3,
     ) -> "VectorPopulation":
-        """Object-vector cells: each fires when something lies in its direction and distance.
+        """Make object-vector cells: each fires for an object at its direction and distance.
 
         Args:
             space: Of the vectors.
@@ -102,7 +102,7 @@ class VectorPopulation(BufferModule):
         seed: int = 0,
         batch: int = 1,
     ) -> "VectorPopulation":
-        """Place cells: each fires at one place of the space; arguments as of the others."""
+        """Make place cells: each fires at one position of the space; arguments as of the others."""
         draw = torch.Generator().manual_seed(seed)
         region = space.bounds_m.to(torch.get_default_dtype())
         encoders = space.encode_fourier(_uniform(region, neurons, draw)).detach()
@@ -118,22 +118,22 @@ class VectorPopulation(BufferModule):
         seed: int = 0,
         batch: int = 1,
     ) -> "VectorPopulation":
-        """Grid cells: each knows the waves of one module; arguments as of the others."""
+        """Make grid cells: each is tuned to the waves of one module; arguments as of the others."""
         draw = torch.Generator().manual_seed(seed)
         region = space.bounds_m.to(torch.get_default_dtype())
         modules = space.grid_modules
         full = space.encode_fourier(_uniform(region, neurons, draw)).detach()
-        mine = torch.zeros(full.shape, dtype=torch.bool)
-        mine.scatter_(1, modules[torch.arange(neurons) % len(modules)], True)
-        return cls(full * mine, region, space, config, time_step_s, draw, batch)
+        own = torch.zeros(full.shape, dtype=torch.bool)
+        own.scatter_(1, modules[torch.arange(neurons) % len(modules)], True)
+        return cls(full * own, region, space, config, time_step_s, draw, batch)
 
     @property
     def n_neurons(self) -> int:
-        """How many."""
+        """Number of neurons."""
         return self.neurons.n_neurons
 
     def forward(self, z: Tensor) -> Tensor:
-        """Step with a vector; return what the neurons say it is, both complex, ``(batch, k)``."""
+        """Step with a vector; return the decoded vector, both complex, ``(batch, k)``."""
         spikes = self.neurons(torch.view_as_real(z).flatten(-2).unsqueeze(0))[0]
         said = (spikes @ self.decoders).reshape(self.decoded.shape)
         self.decoded = lowpass(self.decoded, said, synapse(TAU_S, self.time_step_s))

@@ -1,4 +1,4 @@
-"""Questions to a semantic map: where is it, what is there, how far, and all of it in one vector."""
+"""Queries to a semantic map: positions of landmarks, contents of areas, displacements."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.spiking.space import SSPSpace
 
-_LEAST_STRENGTH = 0.4  # of what is left, in which one more place is looked for
+_LEAST_STRENGTH = 0.4  # of the remainder, above which one more position is sought
 _MOST_PLACES = 50
 _REFINEMENTS = 12
 _BOX_POINTS = 64
-_TWO = 1.4  # strength from which on a place may be two
+_TWO = 1.4  # strength above which a position may be two
 
 
 class Places(NamedTuple):
-    """Places that a vector holds.
+    """Positions that a vector contains.
 
     Attributes:
         position_m: ``(n, dimension)``, the clearest first.
@@ -31,7 +31,7 @@ class Places(NamedTuple):
 
 
 def places_in(space: SSPSpace, z: Tensor, least: float = _LEAST_STRENGTH) -> Places:
-    r"""Find the places whose SSPs add up to a vector.
+    r"""Find the positions whose SSPs sum to a vector.
 
     One place after the other is taken out of it; all are moved together, so that neighbours do not
     pull each other,
@@ -68,7 +68,7 @@ def places_in(space: SSPSpace, z: Tensor, least: float = _LEAST_STRENGTH) -> Pla
 
 
 def _split(space: SSPSpace, z: Tensor, at: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
-    """Take apart what counts for two: places nearer than a wave is long look like one.
+    """Split a position that represents two, nearer to each other than a wavelength.
 
     Both are tried on opposite sides of it, in several directions; the pair stays whose sum is
     nearer to the vector, if none of the two is weak.
@@ -79,28 +79,28 @@ def _split(space: SSPSpace, z: Tensor, at: Tensor, strength: Tensor) -> tuple[Te
         if double < 0 or strength[double] < _TWO:
             return at, strength
         others = torch.cat([at[:double], at[double + 1 :]])
-        best = None
-        for way in _directions(at.shape[1]).to(at):
-            pair = at[double] + apart * torch.stack([way, -way])
+        best: tuple[float, Tensor, Tensor] | None = None
+        for direction in _directions(at.shape[1]).to(at):
+            pair = at[double] + apart * torch.stack([direction, -direction])
             moved, share = _together(space, z, torch.cat([others, pair]))
             left = float((z - share.to(z.dtype) @ space.encode_fourier(moved)).abs().square().sum())
             if best is None or left < best[0]:
                 best = left, moved, share
-        if best[2][-2:].min() < _LEAST_STRENGTH:
+        if best is None or best[2][-2:].min() < _LEAST_STRENGTH:
             return at, strength
         at, strength = best[1], best[2]
     return at, strength
 
 
 def _directions(dimension: int) -> Tensor:
-    """Half of the directions to the neighbours of a cell, ``(n, dimension)``."""
-    ways = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * dimension)
-    ways = ways.reshape(-1, dimension)
-    return ways[: len(ways) // 2]
+    """Return half of the directions to the neighbours of a cell, ``(n, dimension)``."""
+    all_ = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * dimension)
+    all_ = all_.reshape(-1, dimension)
+    return all_[: len(all_) // 2]
 
 
 def _together(space: SSPSpace, z: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Move places and set their strengths by Gauss-Newton, so that they add up to a vector."""
+    """Refine positions and strengths by Gauss-Newton, so that they sum to a vector."""
     waves = space.wave_vectors.detach()
     low, high = space.bounds_m.T.to(at)
     target = torch.cat([z.real, z.imag])
@@ -145,7 +145,7 @@ def where(slam: SSPSLAM, key: Tensor, animal: int = 0) -> Places:
 def what(
     slam: SSPSLAM, low_m: Sequence[float], high_m: Sequence[float], animal: int = 0
 ) -> dict[str, float]:
-    r"""Return how much of each landmark lies in a box; about 1 inside, 0.5 on its edge, 0 outside.
+    r"""Return the share of each landmark in a box; about 1 inside, 0.5 on its edge, 0 outside.
 
     The box's vector, :math:`R = \text{mean}_{x \in D}\,\phi(x)`, is the key of the map from places
     to pointers. A landmark in it is recalled as strongly as the memory answers alike to this key
@@ -219,7 +219,7 @@ def whole_map(slam: SSPSLAM, animal: int = 0) -> Tensor:
 def landmarks_in(
     slam: SSPSLAM, low_m: Sequence[float], high_m: Sequence[float], animal: int = 0
 ) -> dict[str, tuple[float, ...]]:
-    """Return the landmarks that are recalled to places in a box, with these places.
+    """Return the landmarks whose recalled positions are in a box, with these positions.
 
     Sharper at the edges than :func:`what`, and as many recalls as there are landmarks.
     """

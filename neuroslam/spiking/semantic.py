@@ -299,12 +299,13 @@ class SemanticCells(Population):
         """
         now, before = self.now, self.pose
         if belief is None:
-            *here, heading = self._dead_reckoned(before, motion, compass_rad)
+            x, y, heading = self._dead_reckoned(before, motion, compass_rad)
             length = motion.v_m_s * motion.dt_s
             step = length * math.cos(heading), length * math.sin(heading)
         else:
-            *here, heading = belief.pose
-            step = here[0] - before.x_m, here[1] - before.y_m
+            x, y, heading = belief.pose
+            step = x - before.x_m, y - before.y_m
+        here = (x, y)
         self._stay_inside(here)
         now.heading_rad, now.frame = heading, frame
         if belief is not None and math.hypot(*step) > float(self.slam.space.length_scale_m.min()):
@@ -323,12 +324,13 @@ class SemanticCells(Population):
         vector = vectors[rows == attended][0]
         if strength > _KNOWN:
             self._note_place(attended, belief, np.array(here) + vector)
-        place = None
+        place: tuple[float, float] | None = None
         if bool(self.slam.familiar[0]) and (now.told != attended or lost):
             now.told = attended
-            place = tuple((self.known["place_m"][attended].numpy() - vector).tolist())
-        lost = lost and self._is_inside(place)
-        if lost:  # landmarks contradicted for long: kidnapped, or much drift
+            x, y = (self.known["place_m"][attended].numpy() - vector).tolist()
+            place = x, y
+        lost = lost and place is not None and self._is_inside(place)
+        if lost and place is not None:  # landmarks contradicted for long: kidnapped, or much drift
             self.relocalise(place)
         correction, turn = (0.0, 0.0), 0.0
         if self.follows != "cells":

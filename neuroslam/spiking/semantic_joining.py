@@ -70,7 +70,7 @@ def merge_landmarks(
             number = int(join.views[number])
         elif kind == NAMELESS:
             number, free = _same_nameless(one, there[row], free)
-        theirs = {c: other.known[c][row].tolist() for c in columns}
+        theirs: dict[str, Any] = {c: other.known[c][row].tolist() for c in columns}
         at = keys.get((kind, number))
         if theirs["experience"] >= 0:
             theirs["experience"] = int(join.experiences[theirs["experience"]])

@@ -1,4 +1,4 @@
-"""What the semantic cells of a brain are told in a frame, and what they say."""
+"""Input and output of the semantic cells: landmarks in sight, and corrections by them."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from neuroslam.errors import BadFrame
 from neuroslam.sensors.frames import checked_array
 
 NAMED, VIEW, NAMELESS = 0, 1, 2
-"""Kinds of landmarks: with a number of its own, a known view, told apart by place alone."""
+"""Kinds of landmarks: with a number; a view; without a number, identified by position."""
 
 _LARGEST_NUMBER = 2.0**53  # from there on not every whole number is a float64
 
 LEAST_SEEN = 3
-"""Times that a landmark was seen, before it counts: outliers are seen once."""
+"""Number of sightings that confirm a landmark: outliers are seen once."""
 
 
 class Sightings(NamedTuple):
@@ -21,8 +21,8 @@ class Sightings(NamedTuple):
 
     Attributes:
         kind: ``NAMED``, ``VIEW`` or ``NAMELESS``.
-        number: Its own number; of nameless ones it does not count.
-        distance_m: From the robot.
+        number: Number of the landmark; ignored for nameless ones.
+        distance_m: Distance from the robot.
         bearing_rad: Relative to the heading.
     """
 
@@ -33,12 +33,12 @@ class Sightings(NamedTuple):
 
     @classmethod
     def of(cls, *tables: np.ndarray) -> "Sightings":
-        """Take number, distance and bearing of landmarks, ``(n, 3)`` of each sensor.
+        """Make sightings of number, distance and bearing of landmarks, ``(n, 3)`` for each sensor.
 
-        One with a name that several tell is taken from the first of them.
+        A numbered landmark seen by several sensors is taken from the first.
 
         Raises:
-            BadFrame: If the rows cannot be that.
+            BadFrame: If a row is invalid.
 
         Example:
             >>> Sightings.of(np.array([[7.0, 2.0, 0.1]])).with_view(3).kind.tolist()
@@ -46,31 +46,31 @@ class Sightings(NamedTuple):
         """
         rows = np.concatenate((np.empty((0, 3)), *map(checked_landmarks, tables)))
         first = np.unique(rows[:, 0], return_index=True)[1]
-        once = rows[:, 0] < 0  # nameless ones are told apart by their places
+        once = rows[:, 0] < 0  # nameless ones are all kept
         once[first] = True
         rows = rows[once]
         kind = np.where(rows[:, 0] < 0, NAMELESS, NAMED)
         return cls(kind, rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2])
 
     def with_view(self, view: int) -> "Sightings":
-        """Add a known view: a landmark at which the robot stands when it sees it."""
+        """Add a view: a landmark at the robot's own position."""
         row = (VIEW, view, 0.0, 0.0)
         return Sightings(*(np.append(column, x) for column, x in zip(self, row, strict=True)))
 
 
 def checked_landmarks(landmarks: object) -> np.ndarray:
-    """Return the landmarks of a frame, if a sensor can have seen them.
+    """Return the landmarks of a frame as ``float64``, after checking them.
 
     Args:
         landmarks: Number (below 0: it has no name), distance (m) and bearing (rad) of each,
             ``(n, 3)``.
 
     Returns:
-        The same, ``float64``.
+        Array of shape ``(n, 3)``.
 
     Raises:
         BadFrame: If they have another shape or type, a distance is negative, a number is not
-            whole, or something is not finite.
+            whole, or a value is not finite.
 
     Example:
         >>> checked_landmarks([[1.5, 2.0, 0.1]])  # doctest: +ELLIPSIS
@@ -84,22 +84,22 @@ def checked_landmarks(landmarks: object) -> np.ndarray:
     wrong = np.flatnonzero((number != np.floor(number)) | (np.abs(number) >= _LARGEST_NUMBER))
     if len(wrong):
         raise BadFrame(
-            f"a landmark has the number {number[wrong[0]]:g}; expected a whole number below 2**53"
+            f"a landmark has the number {number[wrong[0]]}; expected a whole number below 2**53"
         )
     return rows
 
 
 class LandmarkUpdate(NamedTuple):
-    """What the semantic cells say after a frame.
+    """Correction by landmarks in a frame.
 
     Attributes:
-        correction_m: By how much landmarks corrected the position just now.
-        turn_rad: And the heading.
-        place_m: Where a known landmark puts the robot; ``None``: no other than a moment ago.
-        variance_m2: How sure the robot was of its place when it learnt that landmark.
-        landmark: Row of the landmark that is attended to, or -1.
-        is_new: It is seen for the first time.
-        lost: A known landmark contradicts for long; the robot is where ``place_m`` says.
+        correction_m: Correction of the position.
+        turn_rad: Correction of the heading.
+        place_m: Position of the robot implied by a known landmark; ``None``: no new one.
+        variance_m2: Variance of the robot's position when it learnt that landmark.
+        landmark: Row of the attended landmark, or -1.
+        is_new: Whether it is seen for the first time.
+        lost: Known landmarks contradicted for long: the robot relocalises at ``place_m``.
     """
 
     correction_m: tuple[float, float]

@@ -1,4 +1,4 @@
-"""SSP-SLAM: oscillators keep the position, a map of landmarks learns places and corrects them."""
+"""SSP-SLAM: path integration by oscillators, corrected by an associative map of landmarks."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -25,26 +25,26 @@ from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
 from neuroslam.worlds.landmarks import LandmarkView
 
-_CHUNK = 200  # steps whose inputs are prepared at once
-_GATE_WIDTH = 0.02  # of similarity, over which the gate opens
-_KNOWN = 0.5  # strength of a recall from which a landmark counts as known
-_SETTLED_S = 0.15  # of a landmark, before neurons say it and its place is learnt
-_AREA_INTERCEPT = 0.05  # similarity at which cells of the memory of places fire
-_CONTRADICTS, _AGREES = 0.5, 0.7  # of similarity; side lobes of a space are below the first
-_LOST_GAIN = 1.0  # of what the map says, to one who is lost
+_CHUNK = 200  # steps whose inputs are prepared together
+_GATE_WIDTH = 0.02  # range of similarity over which the gate opens
+_KNOWN = 0.5  # strength of recall above which a landmark is known
+_SETTLED_S = 0.15  # time until neurons represent a landmark and its position is learnt
+_AREA_INTERCEPT = 0.05  # similarity above which cells of the position memory fire
+_CONTRADICTS, _AGREES = 0.5, 0.7  # similarities; side lobes of a space are below the first
+_LOST_GAIN = 1.0  # gain of a correction when lost
 
 
 class SSPStep(NamedTuple):
-    """What SSP-SLAM says after one step.
+    """Result of one step of SSP-SLAM.
 
     Attributes:
-        position_m: Where the animal is, ``(batch, dimension)``.
-        z: Fourier coefficients of it, complex, ``(batch, n_frequencies)``.
-        recall: Strength of what the map recalled, ``(batch,)``.
-        agreement: Similarity of where the map says it is with where it thinks it is, ``(batch,)``.
-        gate: How far the gate was open, ``(batch,)``.
-        lost: Whether the map is believed against the path, ``(batch,)``.
-        attended: Number of the landmark, ``(batch,)``.
+        position_m: Estimated position, ``(batch, dimension)``.
+        z: Its Fourier coefficients, complex, ``(batch, n_frequencies)``.
+        recall: Strength of the recall, ``(batch,)``.
+        agreement: Similarity of recalled and estimated position, ``(batch,)``.
+        gate: Opening of the gate, 0 to 1, ``(batch,)``.
+        lost: Whether the animal is lost, so that the map sets its position, ``(batch,)``.
+        attended: Number of the attended landmark, ``(batch,)``.
     """
 
     position_m: Tensor
@@ -57,26 +57,26 @@ class SSPStep(NamedTuple):
 
 
 class SSPSLAM(BufferModule):
-    r"""Localises an animal and maps landmarks, semantically, in one of three tiers.
+    r"""Localises an animal and maps landmarks as semantic pointers, in one of three tiers.
 
     .. math:: \hat\phi(x_i) = \hat\phi(x) \circledast \phi(x_i - x), \qquad
               u = \eta\, g\,(\hat\phi(x_i) \circledast \phi(x_i - x)^{-1} - \hat\phi(x))
 
-    The first is learnt as what a landmark's pointer recalls; the second, from what is recalled,
-    pulls the path integrator, where the gate :math:`g` finds that both agree. A known landmark that
-    contradicts for ``relocalise_after_s`` is believed: the animal was lost.
+    The first is learnt as the recall of a landmark's pointer; the second, from the recall, corrects
+    the path integrator, if the gate :math:`g` finds that both agree. If a known landmark
+    contradicts for ``relocalise_after_s``, the animal was lost and relocalises by it.
 
     All tiers have the same parts; see their classes for the equations. Velocities and vectors to
-    landmarks are allocentric (turned by a compass).
+    landmarks are allocentric (rotated by a compass).
 
-    State: that of the parts, ``pointers``, the time, what is attended to, and the evidence of being
-    lost. ``gate`` and ``gain`` are parameters, as are the frequencies of the space.
+    State: that of the parts, ``pointers``, the time, the attended landmark, and for how long known
+    landmarks have contradicted. ``gate``, ``gain`` and the frequencies of the space are parameters.
 
     Args:
-        config: All of it.
-        pointers: Of the landmarks that it can tell apart, ``(landmarks, n_key)``; as many features
-            as the space has let them be bound with places, others are keys only.
-        names: Of the landmarks; ``None``: their numbers.
+        config: Config of all parts.
+        pointers: Pointers of the landmarks, ``(landmarks, n_key)``; to be bound with positions they
+            need as many features as the space, else they are keys only.
+        names: Names of the landmarks; ``None``: their numbers.
         batch: Animals side by side.
 
     Raises:
@@ -168,24 +168,24 @@ class SSPSLAM(BufferModule):
 
     @property
     def space(self) -> SSPSpace:
-        """Of the positions; it belongs to the path integrator."""
+        """Space of the positions; it belongs to the path integrator."""
         return self.integrator.space
 
     @property
     def n_neurons(self) -> int:
-        """Of one animal, in all populations."""
+        """Number of neurons of one animal, in all populations."""
         return sum(part.n_neurons for part in self.parts.values())
 
     @property
     def parts(self) -> dict[str, nn.Module]:
-        """Populations that it has, by name."""
+        """Its populations, by name."""
         names = (
             "integrator", "map", "places", "vectors", "grid", "binding", "unbinding", "correction",
         )  # fmt: skip
         return {name: part for name in names if (part := getattr(self, name)) is not None}
 
     def start(self, position_m: Tensor) -> None:
-        """Tell it where it is, ``(batch, dimension)``; what it has learnt stays."""
+        """Set the position, ``(batch, dimension)``; the memory stays."""
         position = self._positions(position_m)
         self.integrator.start(position)
         for name in ("contradicted_s", "held_s", "familiar", "pull"):
@@ -193,7 +193,7 @@ class SSPSLAM(BufferModule):
         self.attended = torch.full_like(self.attended, NOTHING)
 
     def forward(self, velocity_m_s: Tensor, view: LandmarkView | None = None) -> SSPStep:
-        """Live one step; gradients reach the space, ``gate`` and ``gain``.
+        """Advance one step; gradients reach the space, ``gate`` and ``gain``.
 
         Args:
             velocity_m_s: ``(batch, dimension)``.
@@ -213,18 +213,18 @@ class SSPSLAM(BufferModule):
         watch: Callable[[int, SSPStep], None] | None = None,
         every: int = 1,
     ) -> SSPStep:
-        """Live many steps, without gradients.
+        """Advance many steps, without gradients.
 
         Args:
             velocity_m_s: ``(steps, batch, dimension)``.
             view: What is in view, arrays that lead with ``(steps, batch)``; ``None``: nothing.
-            watch: Called after each step with its number and what was said.
-            every: Of so many steps the last is returned.
+            watch: Called after each step with its number and result.
+            every: Number :math:`n`; every n-th step is returned.
 
         Returns:
-            What was said, with the steps in front.
+            Results, with the steps in front.
         """
-        said = []
+        results = []
         for begin in range(0, len(velocity_m_s), _CHUNK):
             part = slice(begin, begin + _CHUNK)
             velocity, sight = self._inputs(velocity_m_s[part], cut(view, part))
@@ -233,18 +233,18 @@ class SSPSLAM(BufferModule):
                 if watch is not None:
                     watch(begin + k, step)
                 if (begin + k + 1) % every == 0:
-                    said.append(step)
-        return SSPStep(*(torch.stack(column) for column in zip(*said, strict=True)))
+                    results.append(step)
+        return SSPStep(*(torch.stack(column) for column in zip(*results, strict=True)))
 
     def _step(
         self, velocity: Tensor, key: Tensor, vector: Tensor, attended: Tensor, held_s: Tensor
     ) -> SSPStep:
         c, space = self.config, self.space
         seen = (attended != NOTHING).to(key)
-        # Neurons need a while to say a landmark; vectors a step, and one to be compared.
+        # Neurons need a while to represent a landmark; vectors one step, and one to be compared.
         settled = held_s > (1.5 * c.time_step_s if c.tier == "algebraic" else _SETTLED_S)
         z = self.integrator(velocity, torch.view_as_complex(self.pull))
-        # Where the landmark is: the position, cleaned up, moved by the vector to it.
+        # Position of the landmark: the position, cleaned up, bound to the vector to it.
         here = z if c.quantised else space.encode_fourier(self.integrator.position_m)
         if self.grid is not None:
             here = self.grid(here)
@@ -254,7 +254,7 @@ class SSPSLAM(BufferModule):
         place = here * vector if self.binding is None else self.binding(here, vector)
         strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
         lost = self._is_lost()
-        # Who is in doubt learns nothing: a map is not bent to where one who is lost believes to be.
+        # No learning while landmarks contradict: the map must not adapt to a wrong position.
         doubts = (self.contradicted_s > 0) & (c.relocalise_after_s > 0)
         learns = seen if c.quantised else (settled & ~doubts).to(key)
         plasticity = learns * self._plasticity(strength)
@@ -262,22 +262,22 @@ class SSPSLAM(BufferModule):
         recall = space.to_fourier(self.map(key, place, seen, plasticity))
         if self.places is not None:
             self.places(place * seen.unsqueeze(-1), key, seen, learns)
-        # Where that puts the animal: what is recalled, moved back by the vector to it.
-        told = recall * vector.conj()
+        # Position of the animal implied by the recall: unbound from the vector.
+        implied = recall * vector.conj()
         if self.unbinding is not None:
-            told = self.unbinding(recall, vector.conj())
+            implied = self.unbinding(recall, vector.conj())
             here = self._late("there", here, TAU_BINDING_S)
-        agreement = (told.real * here.real + told.imag * here.imag).mean(-1)
-        # What is learnt in this very visit knows no more than the animal does.
+        agreement = (implied.real * here.real + implied.imag * here.imag).mean(-1)
+        # What is learnt in the present visit is no more accurate than the position.
         familiar = torch.where(settled, self.familiar, strength > _KNOWN)
         known = familiar & settled & (seen > 0)
         gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * known
         self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
-        unit = told / told.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
+        unit = implied / implied.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
         apart = unit - here
         if self.correction is not None:
-            gain, apart = self.gain.expand(self.batch), self.correction(told, here, seen)
+            gain, apart = self.gain.expand(self.batch), self.correction(implied, here, seen)
             gate = 1.0 - self.correction.veto.clamp(0.0, 1.0)
         self.pull = torch.view_as_real(gain.unsqueeze(-1) * apart)
         self.recalled = torch.view_as_real(recall)
@@ -287,26 +287,26 @@ class SSPSLAM(BufferModule):
         return SSPStep(position, z, strength, agreement, gate, lost, attended)
 
     def _place_memory(self, neurons: NeuronConfig, seed: int) -> AssociativeMap:
-        """A memory whose keys are places: it fires as place cells do."""
+        """Make a memory whose keys are positions: its neurons fire as place cells do."""
         c, draw = self.config, torch.Generator().manual_seed(seed)
         low, high = self.space.bounds_m.T.to(self.pointers)
         at = low + (high - low) * torch.rand(c.map.neurons, len(low), generator=draw)
         n, keys = self.space.n_features, self.space.encode(at).detach()
-        # An area is like each of its places a little: cells must answer to that.
+        # An area has a low similarity with each of its positions; cells must respond to it.
         low = {"voja_rate": 0.0, "intercept": min(c.map.intercept, _AREA_INTERCEPT)}
         config = c.map.model_copy(update=low)
         n_key = self.pointers.shape[1]
         return AssociativeMap(n, n_key, config, neurons, c.time_step_s, seed, self.batch, keys)
 
     def _late(self, name: str, z: Tensor, tau_s: float) -> Tensor:
-        """Delay by as much as the other's synapse does, or who moves would be pulled back."""
+        """Delay like the synapse of the other signal; else motion is corrected backwards."""
         kept = synapse(tau_s, self.config.time_step_s)
         late = lowpass(getattr(self, name), torch.view_as_real(z), kept)
         setattr(self, name, late)
         return torch.view_as_complex(late)
 
     def _plasticity(self, strength: Tensor) -> Tensor:
-        """Share of the rate of learning that is left for what is recalled so strongly."""
+        """Return the share of the learning rate for a recall of this strength."""
         c = self.config.map
         if c.plasticity == "constant":
             return torch.ones_like(strength)
@@ -319,14 +319,14 @@ class SSPSLAM(BufferModule):
         return self.contradicted_s > after
 
     def _note_contradiction(self, known: Tensor, agreement: Tensor) -> None:
-        """Count for how long known landmarks contradict; one that clearly agrees ends it."""
+        """Measure for how long known landmarks contradict; one that clearly agrees resets it."""
         more = self.contradicted_s + self.config.time_step_s
         longer = torch.where(agreement < _CONTRADICTS, more, self.contradicted_s)
         longer = torch.where(agreement > _AGREES, 0.0, longer)
         self.contradicted_s = torch.where(known, longer, self.contradicted_s).detach()
 
     def _inputs(self, velocity: Tensor, view: LandmarkView | None) -> tuple[Tensor, Sight]:
-        """Check and prepare what some steps take in; nothing is changed by it."""
+        """Check and prepare the inputs of some steps, without changing the state."""
         m, kind = self.space.dimension, self.pointers
         if velocity.ndim != 3 or velocity.shape[1:] != (self.batch, m):
             raise SpaceError(
@@ -334,7 +334,9 @@ class SSPSLAM(BufferModule):
                 f"expected (batch, dimension) = {(self.batch, m)}"
             )
         if not bool(torch.isfinite(velocity).all()):
-            raise SpaceError("SSPSLAM: a velocity is not a number; mend or drop that step")
+            raise SpaceError(
+                "SSPSLAM: a velocity is not a finite number; correct or drop that step"
+            )
         steps = len(velocity)
         velocity = velocity.to(kind)
         if view is None:
@@ -348,7 +350,7 @@ class SSPSLAM(BufferModule):
         return velocity, Sight(key, vector, attended, held_s)
 
     def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Pointers and vectors of what is attended to, and which landmark that is."""
+        """Return pointers and vectors of what is attended to, and the attended landmarks."""
         c, kind, n = self.config, self.pointers, len(self.pointers)
         in_view = torch.as_tensor(np.asarray(view.in_view), device=kind.device)
         if in_view.shape != (steps, self.batch, n):

@@ -230,7 +230,7 @@ class SSPSpace(nn.Module):
         return phi / phi.norm(dim=-1, keepdim=True)
 
     def kernel(self, offset_m: Tensor) -> Tensor:
-        r"""Return how alike two positions are that lie so far apart.
+        r"""Return the similarity of two positions by their displacement.
 
         .. math:: k(\delta) = \phi(x) \cdot \phi(x + \delta) =
                   \frac1d \sum_j \cos(A_j \cdot \delta / \ell)

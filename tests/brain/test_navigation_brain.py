@@ -147,7 +147,7 @@ def test_verify_finds_what_makes_no_sense(squares, tmp_path):
     brain.navigation.walls.active[0, 0] = 999
     save_brain(brain, file)
     said = "\n".join(verify(file))
-    assert "place cells 3: linked to cells that are not there" in said
+    assert "place cells 3: linked to cells that do not exist" in said
     assert "active walls 0: not remembered" in said
 
 

@@ -1,6 +1,8 @@
 """The page on populations of one's own is run as it is printed, in a folder that was empty."""
 
+import contextlib
 import csv
+import io
 import os
 import re
 import shlex
@@ -11,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from neuroslam.config.populations import ENTRY_POINTS
+from neuroslam.cli import main
+from neuroslam.config import populations
 from neuroslam.state import mergeable
 from neuroslam.state.population import Population
 
@@ -42,10 +45,26 @@ def home(tmp_path_factory):
     for line in COMMANDS:
         program, *words = shlex.split(line)
         assert program == "neuroslam"
-        done = started("-m", "neuroslam.cli", *words, cwd=folder)
-        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
-        printed[" ".join(words[:2])] = done.stdout
+        with forgetful(folder), contextlib.redirect_stdout(io.StringIO()) as out:
+            code = main(words)
+        assert code == 0, f"{line}\n{out.getvalue()}"
+        printed[" ".join(words[:2])] = out.getvalue()
     return folder, printed
+
+
+@contextlib.contextmanager
+def forgetful(folder):
+    """Be in a folder, and forget afterwards what was loaded, as if a process had ended."""
+    before = dict(populations.registered)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        patched.setenv("COLUMNS", "200")
+        patched.setenv(populations.PLUGINS, "")
+        patched.setattr(populations, "_loaded", {})
+        yield
+    for kind in populations.registered.keys() - before.keys() - populations.HOMES.keys():
+        del populations.registered[kind]
+    sys.modules.pop("neuroslam_plugin_visits", None)
 
 
 def visits(folder):
@@ -113,15 +132,17 @@ def test_the_program_of_the_page_prints_what_was_counted(home):
     (program,) = PROGRAMS
     done = started("-c", program, cwd=home[0])
     assert done.returncode == 0, done.stderr
-    listed, counts = done.stdout.splitlines()
-    assert len(eval(listed)) > 5
-    assert "'visits'" in counts
+    columns, *table, counts = filter(None, done.stdout.splitlines())
+    assert columns == "view,visits"
+    assert len(table) > 5
+    total = sum(int(row.partition(",")[2]) for row in table)
+    assert f"'visits': tensor({total})" in counts
 
 
 def test_the_entry_point_of_the_page_is_the_one_that_is_looked_for():
     (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     assert tomllib.loads(text)["project"]["entry-points"] == {
-        ENTRY_POINTS: {"visits": "my_package.visits:Visits"}
+        populations.ENTRY_POINTS: {"visits": "my_package.visits:Visits"}
     }
 
 

@@ -346,7 +346,7 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
     began = [session["began"] for session in page.about["sessions"]]
     assert "kidnapped" in began
     written = (Path(collect.__file__).parent / "tables.js").read_text()
-    words = re.search(r"const BEGAN = \{(.*?)\};", written)[1]
+    words = re.search(r"const BEGAN = \{(.*?)\};", written, re.DOTALL)[1]
     assert {*began, "start", "gap"} <= set(re.findall(r"(\w+):", words))
 
 

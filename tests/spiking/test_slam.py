@@ -336,7 +336,7 @@ def test_neighbours_are_told_apart():
 
 NOTHING = torch.zeros(1, 1, 2)
 WRONG = {
-    "not a number": lambda s, v: s.run(NOTHING + torch.nan, v),
+    "not a finite number": lambda s, v: s.run(NOTHING + torch.nan, v),
     r"\(batch, dimension\) = \(1, 2\)": lambda s, v: s.run(torch.zeros(1, 1, 3), v),
     "velocities of shape": lambda s, v: s.run(torch.zeros(1, 2, 2), v),
     "one column": lambda s, v: s.run(NOTHING, v._replace(in_view=v.in_view[..., :2])),

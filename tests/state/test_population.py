@@ -282,7 +282,7 @@ def test_a_sound_run_and_a_sound_merge_are_told_so(runs):
         ("first.pose", lambda pose: pose[:-1], "tally.first: "),
         ("first.pose", lambda pose: pose * math.nan, "tally.first.pose: not finite"),
         ("weights", lambda weights: weights[:2], "size mismatch for tally.weights"),
-        ("seen", lambda seen: seen.double(), "tally.seen: torch.float64, expected torch.int64"),
+        ("seen", lambda seen: seen.double(), "tally.seen: torch.float64; expected torch.int64"),
         ("now.view", lambda _: None, "tally.now.view: missing"),
     ],
 )
@@ -400,8 +400,8 @@ def plugin(tmp_path, monkeypatch):
     path = tmp_path / "draws.py"
     path.write_text(PLUGIN)
     yield path
-    populations.registered.clear()
-    populations.registered.update(before)
+    for kind in populations.registered.keys() - before.keys() - populations.HOMES.keys():
+        del populations.registered[kind]
     for name in set(sys.modules) - modules:
         if name.startswith("neuroslam_plugin_"):
             del sys.modules[name]

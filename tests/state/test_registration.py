@@ -35,8 +35,8 @@ def clean(monkeypatch):
     monkeypatch.setattr(populations, "_loaded", dict(populations._loaded))
     before, modules = dict(populations.registered), set(sys.modules)
     yield
-    populations.registered.clear()
-    populations.registered.update(before)
+    for kind in populations.registered.keys() - before.keys() - populations.HOMES.keys():
+        del populations.registered[kind]
     for name in set(sys.modules) - modules:
         if name.startswith(("neuroslam_plugin_", "acme_")):
             del sys.modules[name]
@@ -346,6 +346,14 @@ def test_a_file_registers_once_and_again_when_it_was_changed(tmp_path):
     with pytest.raises(ConfigError, match="ZeroDivisionError"):
         populations.load_plugin(path)
     assert populations.population_class("filed").VALUE == 2
+
+
+def test_a_file_that_fails_takes_nothing_of_the_package_with_it(tmp_path):
+    path = tmp_path / "wrong.py"
+    path.write_text("import neuroslam.cells.speed\n1 / 0\n")
+    with pytest.raises(ConfigError, match="ZeroDivisionError"):
+        populations.load_plugin(path)
+    assert NavigationBrain(BrainConfig(cells="pose+speed")).speed
 
 
 def test_two_files_may_have_one_name_but_not_one_kind(tmp_path):
