@@ -106,7 +106,7 @@ def summarise(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
         if one.cells is not None:
             values["cells"] = one.cells.values[:, -1]
             values["cells_growth_last_third_percent"] = growth_percent(one.cells)
-        row = {"track": one.track, "condition": one.condition, "method": one.method}
+        row: dict[str, Any] = {"track": one.track, "condition": one.condition, "method": one.method}
         for key, value in values.items():
             row |= {key: float(np.mean(value)), f"{key}_sd": float(np.std(value))}
         rows.append(row | dict(one.more))
@@ -129,7 +129,7 @@ def growth_percent(cells: Spread) -> np.ndarray:
         array([4.])
     """
     then = int(np.searchsorted(cells.minutes, cells.minutes[-1] * 2 / 3 - 1e-9))
-    return 100.0 * (cells.values[:, -1] / cells.values[:, then] - 1.0)
+    return np.asarray(100.0 * (cells.values[:, -1] / cells.values[:, then] - 1.0))
 
 
 def _motion(condition: str) -> str:

@@ -85,7 +85,8 @@ def run_session(
     brain.about = (name, "", "")
     if stored is not None:
         brain.store(stored)
-    rows, merge_snapshots, created = [], [], 0
+    rows, created = [], 0
+    merge_snapshots: list[MergeSnapshots] = []
     for frame in frames:
         partial, others, merges = brain.map, list(brain.stored), len(brain.sessions.merges)
         result = brain(frame)

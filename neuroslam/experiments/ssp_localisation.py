@@ -76,7 +76,8 @@ def ssp_localisation(
         "each its own": [random_world(10, seed=100 + k) for k in range(len(paths))],
     }
     worlds = [w for each in sets.values() for w in each]
-    rows, simulations, truth = [], {}, _landmarks(worlds)
+    rows, truth = [], _landmarks(worlds)
+    simulations: dict[str, Simulation] = {}
     for method in methods:
         alone = integrate(slam_in(CONFIGS[method], world, batch=len(paths)), paths)
         slam = slam_in(CONFIGS[method], world, batch=len(worlds))

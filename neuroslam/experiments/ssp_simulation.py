@@ -53,8 +53,8 @@ def pointers_of(world: LandmarkWorld, n_features: int, seed: int = 0) -> Semanti
     pointers = [landmark.pointer for landmark in world.landmarks]
     words = sorted({w for s in pointers for w in s.replace("*", " ").replace("+", " ").split()})
     structured = any(not pointer.isidentifier() for pointer in pointers)
-    kind = "unitary" if structured or len(words) > n_features else "orthogonal"
-    return SemanticPointers(words, n_features, seed, kind)
+    unitary = structured or len(words) > n_features
+    return SemanticPointers(words, n_features, seed, "unitary" if unitary else "orthogonal")
 
 
 def slam_in(config: SSPSLAMConfig, world: LandmarkWorld, batch: int = 1) -> SSPSLAM:
