@@ -71,6 +71,7 @@ class NavigationBrain(BrainState):
             :class:`~neuroslam.view.features.FeatureEncoder`.
 
     Example:
+        >>> from neuroslam.config import BrainConfig
         >>> from neuroslam.types import Frame, Velocity
         >>> brain = NavigationBrain(BrainConfig())
         >>> picture = torch.arange(160 * 120).reshape(120, 160).to(torch.uint8).numpy()
@@ -167,7 +168,7 @@ class NavigationBrain(BrainState):
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""
-        some = [(author, c) for author, c in made if moves_others(author, c)]
+        some = [(author, c) for author, c in made if c is not None and moves_others(author, c)]
         if not some:
             return
         leader = self.leader

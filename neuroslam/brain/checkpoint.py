@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.config import BrainConfig, build_config
-from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning
-from neuroslam.state.files import first_line, load_checked, save_checked
+from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, first_line
+from neuroslam.state.files import load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
 FORMAT_VERSION = 4

@@ -119,7 +119,8 @@ class BrainConfig(Section):
             >>> BrainConfig(cells="pose+speed").section("speed") == BrainConfig(cells="speed").speed
             True
         """
-        return getattr(self, kind)
+        section: Section = getattr(self, kind)
+        return section
 
 
 def _kinds(value: object) -> list[str]:

@@ -173,11 +173,12 @@ def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:
 
 def _pixels(brain: Mapped, experiences: np.ndarray) -> np.ndarray:
     """Return the templates of experiences, one row each; equal rows for a map without templates."""
-    views = brain.map.experiences["template"].numpy()[experiences]
+    views: np.ndarray = brain.map.experiences["template"].numpy()[experiences]
     if not brain.view.n:
         return np.zeros((len(experiences), 1))
     pixels: np.ndarray = brain.view.templates["pixels"].numpy(force=True)
-    return pixels[views].reshape(len(experiences), -1)
+    rows: np.ndarray = pixels[views].reshape(len(experiences), -1)
+    return rows
 
 
 def _aliases(of: ExperienceMap) -> dict[str, np.ndarray]:

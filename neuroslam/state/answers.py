@@ -55,7 +55,8 @@ def pictures_of(population: Population) -> dict[str, Picture]:
     pictures: dict[str, Picture] = {}
     for tag, picture in _named(population, "images", population.images()).items():
         layered = isinstance(picture, tuple | list)
-        layers = tuple(_array(layer) for layer in (picture if layered else (picture,)))
+        parts = picture if isinstance(picture, tuple | list) else (picture,)
+        layers = tuple(_array(layer) for layer in parts)
         coloured = [layer.dtype == np.uint8 and layer.shape[2:] == (3,) for layer in layers]
         if any(layer.ndim != 2 and (layered or not rgb)
                for layer, rgb in zip(layers, coloured, strict=True)):  # fmt: skip
@@ -76,8 +77,8 @@ def tables_of(population: Population) -> dict[str, str]:
         TypeError: If a table is no text that begins with its columns, or its name is no plain
             file name that ends in ``.csv``, or one of :data:`RUN_TABLES`.
     """
-    tables = _named(population, "tables", population.tables())
-    for name, text in tables.items():
+    tables: dict[str, str] = {}
+    for name, text in _named(population, "tables", population.tables()).items():
         if not re.fullmatch(r"[\w-]+\.csv", name) or name in RUN_TABLES:
             raise TypeError(
                 f"{_who(population)}.tables(): {name!r} is not a name for it; expected one like "
@@ -88,7 +89,8 @@ def tables_of(population: Population) -> dict[str, str]:
                 f"{_who(population)}.tables(): {name!r} is {text!r:.40}; expected text whose first "
                 "line has the columns"
             )
-    return dict(tables)
+        tables[name] = text
+    return tables
 
 
 def moves_others(population: Population | None, correction: Correction | None) -> bool:

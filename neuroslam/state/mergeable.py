@@ -55,7 +55,7 @@ class ModulesOf(nn.ModuleList, Generic[M]):
 
         def __iter__(self) -> Iterator[M]: ...
 
-        @overload
+        @overload  # type: ignore[override]  # torch returns modules of any class
         def __getitem__(self, idx: int) -> M: ...
 
         @overload

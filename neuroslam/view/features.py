@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from neuroslam.config import ViewConfig
-from neuroslam.errors import BadFrame, ConfigError
+from neuroslam.errors import BadFrame, ConfigError, first_line
 from neuroslam.sensors.frames import check_image
-from neuroslam.state.files import first_line, tensors_digest
+from neuroslam.state.files import tensors_digest
 from neuroslam.view import vision
 from neuroslam.view.preprocess import Encoded, crop, encode
 

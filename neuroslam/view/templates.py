@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError, MapError
@@ -256,14 +256,14 @@ class LocalViewCells(Mergeable):
         self._check(view)
         columns = np.ascontiguousarray(view.T)
         pixels = to_bytes(columns)
-        row: dict[str, object] = {
+        row: dict[str, float | Tensor] = {
             "pixels": torch.from_numpy(pixels.reshape(-1)),
             "blocks": torch.from_numpy(template_blocks(pixels, self.geometry)),
         }
         if self._exact:
             row["values"] = torch.from_numpy(columns.reshape(-1))
         if self.config.mean_gate:
-            row["mean"] = view.mean() if self._exact else pixels.mean() / 255.0
+            row["mean"] = float(view.mean() if self._exact else pixels.mean() / 255.0)
         if isinstance(self.encoder, FeatureEncoder):
             self.network.digest = self.encoder.digest
         return self.templates.append(**row)
