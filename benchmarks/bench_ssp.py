@@ -13,7 +13,7 @@ from neuroslam.config.semantic import (
     SemanticMapConfig,
     SSPSLAMConfig,
 )
-from neuroslam.experiments.ssp_lives import slam_in, views
+from neuroslam.experiments.ssp_simulation import slam_in, views
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.worlds.landmark_paths import band_limited_path

@@ -28,7 +28,14 @@ import torch
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
 from neuroslam.evaluation.icp import fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import align
-from neuroslam.experiments.lives import Picture, bindings, live, measure, stage, track
+from neuroslam.experiments.session_runs import (
+    MapSnapshot,
+    bindings,
+    measure,
+    run_session,
+    stage,
+    track,
+)
 from neuroslam.figures.maps import contact_sheet, plot_frame_and_template, plot_map
 from neuroslam.figures.sessions import plot_bindings, plot_overlay, plot_stages
 from neuroslam.figures.style import SESSIONS, STYLE, legend_below, write_title
@@ -57,7 +64,7 @@ print(f"{same} of the {lap} images of the second lap are equal to those of the f
 # **What to see:** the path is open; the robot never returned to its start.
 
 # %%
-monday = live(frames[:300], config, name="monday")
+monday = run_session(frames[:300], config, name="monday")
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "monday.safetensors"
     save_brain(monday.brain, file)
@@ -96,7 +103,7 @@ for tuesdays, mondays, error in agreed:
 
 # %%
 sessions = [stored.sessions.now.id, brain.sessions.now.id]
-before, partial, after = (Picture.of(one) for one in (stored.map, own, brain.map))
+before, partial, after = (MapSnapshot.of(one) for one in (stored.map, own, brain.map))
 little = stage("Tuesday", partial, sessions, partial.poses[[z], :2])
 plot_stages(
     [stage(f"Frame {met}: two maps", before, sessions, before.poses[[u], :2], (little,))],
@@ -143,13 +150,13 @@ corridor = list(open_source("world:corridor?laps=1").frames())
 panels = []
 for confirm in (1, 4):
     poor = BrainConfig(view={"threshold": 0.09}, sessions={"confirm": confirm})
-    gallery = live(frames[:300], poor, name="gallery")
-    lost = live(corridor[:60], poor, gallery.brain, name="corridor")
+    gallery = run_session(frames[:300], poor, name="gallery")
+    lost = run_session(corridor[:60], poor, gallery.brain, name="corridor")
     ids = [life.brain.sessions.now.id for life in (gallery, lost)]
-    here, known = Picture.of(lost.brain.map), Picture.of(gallery.brain.map)
-    if lost.joints:
-        match = lost.joints[0].report["match"]
-        print(f"confirm = {confirm}: joined at frame {lost.joints[0].frame}, wrongly")
+    here, known = MapSnapshot.of(lost.brain.map), MapSnapshot.of(gallery.brain.map)
+    if lost.merge_snapshots:
+        match = lost.merge_snapshots[0].report["match"]
+        print(f"confirm = {confirm}: joined at frame {lost.merge_snapshots[0].frame}, wrongly")
         ring = here.poses[[match["loaded_experience"]], :2]
         panels.append(stage(f"confirm = {confirm}: joined", here, ids, ring))
     else:
@@ -172,8 +179,8 @@ print("\n".join(report.lines()))
 
 # %%
 # The same frames again, with the trajectory recorded.
-tuesday = live(frames[320:], config, stored, name="tuesday")
-final = Picture.of(tuesday.brain.map)
+tuesday = run_session(frames[320:], config, stored, name="tuesday")
+final = MapSnapshot.of(tuesday.brain.map)
 ends = [stored.sessions.now.id, tuesday.brain.sessions.now.id]
 turned = f"Right after: turned by {np.degrees(report.rotation_rad):.0f}°"
 plot_stages(
@@ -197,7 +204,7 @@ plot_stages(
 # other.
 
 # %%
-single = live(frames, config, name="single")
+single = run_session(frames, config, name="single")
 cells = config.pose_cells
 torus = (cells.n_xy, cells.n_xy, cells.n_theta)
 plot_bindings(bindings(single, [monday, tuesday]), torus, "Bindings of experiences to pose cells")
@@ -216,7 +223,7 @@ plot_bindings(bindings(single, [monday, tuesday]), torus, "Bindings of experienc
 lives = {"turn": tuesday}
 for how in ("shift", "none"):
     other = BrainConfig(sessions={"cells": how})
-    lives[how] = live(frames[320:], other, stored, name="tuesday")
+    lives[how] = run_session(frames[320:], other, stored, name="tuesday")
 names = {"turn": "shifted and turned", "shift": "only shifted", "none": "not moved"}
 figure, axes = plt.subplots(figsize=(7.5, 4.2))
 for (how, life), colour in zip(lives.items(), SESSIONS, strict=False):
@@ -227,7 +234,7 @@ for (how, life), colour in zip(lives.items(), SESSIONS, strict=False):
     axes.plot(np.arange(met, len(frames)), count, color=colour, lw=4 if how == "turn" else 1.6,
               label=f"{names[how]}: {life.brain.map.n}")  # fmt: skip
     print(
-        f"{names[how]}: {life.brain.map.n} experiences, {life.created_at_known} of them created again"
+        f"{names[how]}: {life.brain.map.n} experiences, {life.created_at_known_views} of them created again"
     )
 axes.axhline(single.brain.map.n, color="0.2", ls="--", lw=1,
              label=f"single session: {single.brain.map.n}")  # fmt: skip
@@ -307,7 +314,7 @@ plt.show()
 
 # %%
 changing = open_source("world:ellipse?laps=3.8&width=256&height=64&light=0.2")
-wednesday = live(changing.frames(600, 820), config, name="wednesday").brain
+wednesday = run_session(changing.frames(600, 820), config, name="wednesday").brain
 print(find_match(monday.brain, wednesday).reason)
 merged, (report,) = join_brains(monday.brain, wednesday)
 print("\n".join(report.lines()))
@@ -320,9 +327,9 @@ print("\n".join(report.lines()))
 days = [monday.brain.sessions.now.id, wednesday.sessions.now.id]
 plot_stages(
     [
-        stage("Monday", Picture.of(monday.brain.map), days),
-        stage("Wednesday", Picture.of(wednesday.map), days),
-        stage("Merged", Picture.of(merged.map), days),
+        stage("Monday", MapSnapshot.of(monday.brain.map), days),
+        stage("Wednesday", MapSnapshot.of(wednesday.map), days),
+        stage("Merged", MapSnapshot.of(merged.map), days),
     ],
     "Two finished sessions become one map",
 )
@@ -332,7 +339,7 @@ plot_stages(
 # corridor, with the default threshold:
 
 # %%
-elsewhere = live(corridor[:200], config, name="corridor").brain
+elsewhere = run_session(corridor[:200], config, name="corridor").brain
 nothing, (report,) = join_brains(monday.brain, elsewhere)
 print("\n".join(report.lines()))
 
@@ -348,12 +355,12 @@ print("\n".join(report.lines()))
 # %%
 order = [*range(250), *range(120, 250)]
 drive = [corridor[i]._replace(index=k, time_s=0.1 * k) for k, i in enumerate(order)]
-kidnapped = live(drive, config, name="kidnapped")
+kidnapped = run_session(drive, config, name="kidnapped")
 for session in kidnapped.brain.sessions.sessions:
     print(
         f"{session.name}: {session.began}, from frame {session.first_frame}, {session.frames} frames"
     )
-(joint,) = kidnapped.joints
+(joint,) = kidnapped.merge_snapshots
 print(f"joined at frame {joint.frame}: {MergeReport(**joint.report).lines()[0]}")
 xy, truth = track(kidnapped.brain, [kidnapped])
 xy = align(xy, truth).apply(xy)

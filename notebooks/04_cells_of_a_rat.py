@@ -28,7 +28,7 @@ from neuroslam.cells.boundary import boundary_activity, boundary_zone
 from neuroslam.config import BrainConfig, GridCellConfig, build_config, read_preset
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
-from neuroslam.experiments.animals import live, path_integration, position_errors
+from neuroslam.experiments.animals import path_integration, position_errors, simulate
 from neuroslam.figures.cells import Firing, draw_arena, plot_firing_maps, plot_grids
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import INK, LOOP, MAP, ODOMETRY, ROBOT, STYLE
@@ -105,7 +105,7 @@ def note(i, here, cells):
         boundary.append(cells.boundary.rates[0].flatten().numpy().copy())
 
 
-life = live(walk, seeds=range(4), hook=note)
+life = simulate(walk, seeds=range(4), hook=note)
 bins = Bins.around(arena.outlines[0], 0.04)
 seen = walk.positions[::2]
 print(position_errors(life.estimate_m, walk.positions).mean_m.round(3), "m with walls")

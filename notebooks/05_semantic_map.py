@@ -24,8 +24,8 @@ import numpy as np
 import torch
 
 from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig, SSPSLAMConfig
-from neuroslam.experiments.ssp_lives import integrate, live, pointers_of, slam_in, views
 from neuroslam.experiments.ssp_map import similarity_map
+from neuroslam.experiments.ssp_simulation import integrate, pointers_of, simulate, slam_in, views
 from neuroslam.figures.landmarks import Query, plot_area, plot_queries
 from neuroslam.figures.spikes import plot_errors, plot_rasters, plot_signals, plot_trials
 from neuroslam.figures.style import INK, MAP, STYLE
@@ -75,7 +75,7 @@ config = SSPSLAMConfig(
     places=True,
 )
 slam = slam_in(config, world)
-life = live(slam, [world], [path])
+life = simulate(slam, [world], [path])
 print(f"error {1000 * life.ate_m[0]:.2f} mm; seen for", life.seen_s[0].round(1).tolist(), "s")
 
 # %% [markdown]
@@ -136,7 +136,7 @@ ten = random_world(10, seed=1)
 walk = band_limited_path(120.0, 0.08, seed=3, time_step_s=0.01)
 drift = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=alone), ten), [walk])
 kept = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [walk])
-closed = live(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [ten], [walk])
+closed = simulate(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [ten], [walk])
 at = np.array([landmark.position_m for landmark in ten.landmarks])
 plot_trials(
     {
@@ -226,7 +226,7 @@ plot_signals(
 # %%
 shift = np.array([0.15, -0.1])
 first_map, second_map = (slam_in(SSPSLAMConfig(**noisy), ten) for _ in range(2))
-live(first_map, [ten], [walk.first(70.0)])
+simulate(first_map, [ten], [walk.first(70.0)])
 later = walk._replace(position_m=walk.position_m[6000:])
 start = torch.from_numpy(later.position_m[:1] + shift).clamp(-1, 1)
 second_map.start(start)

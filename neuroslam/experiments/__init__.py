@@ -1,4 +1,4 @@
-"""Experiments of the papers: each writes ``results.json`` and its figures into a folder."""
+"""Experiments of the papers; each writes ``results.json`` and its figures into a folder."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -38,10 +38,10 @@ EXPERIMENTS = {
     "ssp-kitti": ("neuroslam.experiments.ssp_kitti", "ssp_kitti", "kitti_00"),
     "threshold-sweep": ("neuroslam.experiments.place_cells", "threshold_sweep", "rodent"),
 }
-"""Name -> module, function, folder of its recordings in the data; ``None``: it needs none."""
+"""Name -> module, function, and folder of its recordings in the data, or ``None``."""
 
-_IF_THERE = {"ssp-localisation": "ssp"}
-"""Name -> folder of recordings that are used if they are there; else random ones like them."""
+_OPTIONAL = {"ssp-localisation": "ssp"}
+"""Name -> folder of recordings that are used if present; otherwise random ones are generated."""
 
 
 def run_experiment(
@@ -52,19 +52,19 @@ def run_experiment(
     ray: str | None = None,
     networks: Mapping[str, Path] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run an experiment; returns its rows, with named, unit-carrying keys.
+    """Run an experiment and return its rows; their keys carry units.
 
     Args:
         name: One of ``EXPERIMENTS``.
-        data: Folder that holds the folders of the recordings; ``None`` if it needs none.
+        data: Folder that holds the folders of the recordings; ``None`` if not needed.
         out: Folder to write.
-        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`, where it has independent lives.
-        ray: The same.
-        networks: ``view.features`` -> file of weights, where it compares views.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`, for independent simulations.
+        ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
+        networks: ``view.features`` -> file of weights, for experiments that compare views.
 
     Raises:
-        RunError: If there is no such experiment, its recording is not there, or it has no
-            independent lives or views that ``jobs``, ``ray`` or ``networks`` could be used for.
+        RunError: If there is no such experiment, its recording is missing, or it has no independent
+            simulations or views for ``jobs``, ``ray`` or ``networks``.
     """
     if name not in EXPERIMENTS:
         raise RunError(
@@ -73,23 +73,24 @@ def run_experiment(
         )
     module, function, folder = EXPERIMENTS[name]
     recordings = None
-    if folder is None and data is not None and name in _IF_THERE:
-        wanted = Path(data) / _IF_THERE[name]
-        recordings = wanted if wanted.is_dir() else None
+    if folder is None and data is not None and name in _OPTIONAL:
+        optional = Path(data) / _OPTIONAL[name]
+        recordings = optional if optional.is_dir() else None
     if folder is not None:
         if data is None:
-            raise RunError(f"{name}: needs a recording; say with --data which folder holds it")
+            raise RunError(f"{name}: needs a recording; give the folder that holds it with --data")
         recordings = Path(data) / folder
         if not recordings.is_dir():
-            raise RunError(f"{recordings}: no such recording; say where with --data")
-    experiment, more = getattr(import_module(module), function), {}
+            raise RunError(f"{recordings}: no such recording; give its parent folder with --data")
+    experiment = getattr(import_module(module), function)
+    options: dict[str, Any] = {}
     if networks:
         if "networks" not in signature(experiment).parameters:
             raise RunError(f"{name}: compares no views; leave --network out")
-        more["networks"] = networks
+        options["networks"] = networks
     if jobs is not None or ray is not None:
         if "jobs" not in signature(experiment).parameters:
-            raise RunError(f"{name}: its lives depend on each other; leave --jobs and --ray out")
-        more |= {"jobs": jobs, "ray": ray}
-    result = experiment(recordings, Path(out), **more)
-    return result["rows"]
+            raise RunError(f"{name}: cannot run in parallel; leave --jobs and --ray out")
+        options |= {"jobs": jobs, "ray": ray}
+    rows: list[dict[str, Any]] = experiment(recordings, Path(out), **options)["rows"]
+    return rows

@@ -1,4 +1,4 @@
-"""What the experiments with rats share: their tracks, lives of navigation cells, and errors."""
+"""Common parts of the experiments with rats: tracks, simulation of navigation cells, errors."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +10,9 @@ import torch
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
+from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
+from neuroslam.worlds.arena import Arena
 from neuroslam.worlds.rodent import Walk, read_walk
 from neuroslam.worlds.senses import SenseNoise, Senses, sense
 
@@ -24,21 +26,21 @@ TRACKS = {
 """Name -> recording: RatInABox agents in polygons, and two real rats in circles."""
 
 RATE_HZ = 20.0
-WALLS = 2  # at most, that an animal feels at once: a corner's
+WALLS = 2  # that an animal senses at once, at most: those of a corner
 
 Hook = Callable[[int, NavigationEstimate, NavigationCells], object]
-"""Called after every step, with its number, what the cells say, and the cells."""
+"""Called after every step with its number, the estimate, and the cells."""
 
 
-class Life(NamedTuple):
-    """Navigation cells that lived through a walk, one for each seed of the noise.
+class Simulation(NamedTuple):
+    """A simulation of navigation cells on a walk, one animal for each seed of the noise.
 
     Attributes:
-        walk: What truly happened.
-        senses: What was sensed of it.
-        estimate_m: Positions that the cells told, in the world, ``(seeds, steps, 2)``.
-        lost: Whether they said that they were lost, ``(seeds, steps)``.
-        cells: As they were at the end.
+        walk: The true motion.
+        senses: The sensor data.
+        estimate_m: Estimated positions in the world, ``(seeds, steps, 2)``.
+        lost: Whether the animal is lost, ``(seeds, steps)``.
+        cells: The cells at the end.
     """
 
     walk: Walk
@@ -48,13 +50,24 @@ class Life(NamedTuple):
     cells: NavigationCells
 
 
+def arena_of(walk: Walk) -> Arena:
+    """Return the arena of a walk.
+
+    Raises:
+        MapError: If the walk has none.
+    """
+    if walk.arena is None:
+        raise MapError("walk: has no arena; read a recording with vertices or arena_radius")
+    return walk.arena
+
+
 class Errors(NamedTuple):
     """Errors of position in metres, one for each seed.
 
     Attributes:
-        mean_m: Mean distance to the truth, as it is.
-        rmse_m: Root mean square of it.
-        aligned_m: Root mean square after rigid alignment, the field's usual ATE.
+        mean_m: Mean distance to the truth, without alignment.
+        rmse_m: RMSE without alignment.
+        aligned_m: RMSE after rigid alignment (ATE).
     """
 
     mean_m: np.ndarray
@@ -63,31 +76,31 @@ class Errors(NamedTuple):
 
 
 def read_track(data: Path, name: str, minutes: float = 30.0) -> Walk:
-    """Read one of ``TRACKS`` at 20 Hz; a shorter recording is run to and fro, but Sargolini's.
+    """Read one of ``TRACKS`` at 20 Hz; a recording that is too short is run to and fro.
 
     Args:
         data: Folder of the recordings.
-        name: Of the track.
-        minutes: How long.
+        name: Name of the track.
+        minutes: Duration; at most that of the recording for ``sargolini``.
     """
     walk = read_walk(data / TRACKS[name], rate_hz=RATE_HZ)
     return walk.lasting(min(minutes, walk.duration_s / 60) if name == "sargolini" else minutes)
 
 
-def live(
+def simulate(
     walk: Walk,
     seeds: Sequence[int],
     config: BrainConfig | None = None,
     noise: SenseNoise | None = None,
     hook: Hook | None = None,
-) -> Life:
-    """Let a batch of animals live through a walk, each with its own noise.
+) -> Simulation:
+    """Simulate a batch of animals on a walk, each with its own noise.
 
     Args:
-        walk: In an arena.
-        seeds: One for each animal.
-        config: Of the cells; ``None``: the defaults.
-        noise: Of the senses; ``None``: the defaults.
+        walk: A walk in an arena.
+        seeds: Seed of the noise of each animal.
+        config: Config of the cells; ``None``: the defaults.
+        noise: Noise of the senses; ``None``: the defaults.
         hook: Called after every step.
     """
     senses = sense(walk, noise or SenseNoise(), seeds, k=WALLS)
@@ -100,12 +113,14 @@ def live(
         if hook is not None:
             hook(i, here, cells)
 
-    cells = live_with(senses, config or BrainConfig(), note)
-    return Life(walk, senses, np.moveaxis(estimate, 1, 0) + walk.positions[0], lost.T.copy(), cells)
+    cells = run_cells(senses, config or BrainConfig(), note)
+    return Simulation(
+        walk, senses, np.moveaxis(estimate, 1, 0) + walk.positions[0], lost.T.copy(), cells
+    )
 
 
-def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCells:
-    """Let navigation cells live through what was sensed; returns them as they are at the end."""
+def run_cells(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCells:
+    """Run navigation cells on sensor data and return them in their final state."""
     cells = NavigationCells(config, batch=len(senses.speed_m_s))
     columns = [
         torch.from_numpy(np.ascontiguousarray(np.moveaxis(column, 1, 0)))
@@ -119,14 +134,14 @@ def live_with(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCell
 
 
 def path_integration(senses: Senses) -> np.ndarray:
-    """Dead-reckon what was sensed, from the true start; ``(seeds, steps, 2)``."""
+    """Return dead-reckoned positions from the true start, ``(seeds, steps, 2)``."""
     steps = senses.speed_m_s * senses.dt_s
     heading = np.stack([np.cos(senses.heading_rad), np.sin(senses.heading_rad)], axis=-1)
-    return senses.position_m[0] + np.cumsum(steps[..., None] * heading, axis=1)
+    return np.asarray(senses.position_m[0] + np.cumsum(steps[..., None] * heading, axis=1))
 
 
 def position_errors(estimate_m: np.ndarray, truth_m: np.ndarray) -> Errors:
-    """Measure the errors of tracks, ``(seeds, steps, 2)``, against the truth, ``(steps, 2)``."""
+    """Return the errors of tracks, ``(seeds, steps, 2)``, against the truth, ``(steps, 2)``."""
     distance = np.linalg.norm(estimate_m - truth_m, axis=-1)
     aligned = [absolute_trajectory_error(one, truth_m, "rigid").rmse for one in estimate_m]
     return Errors(

@@ -1,8 +1,8 @@
-"""Boundary cells on the way to walls, corners and curved walls, and where they fire.
+"""Boundary cells on paths to walls, corners and curved walls, and their rate maps.
 
-The six scenarios of Figs. 3 and 4 of the SLRB paper, by its own account of them: activity grows
-near a wall, fades farther off, and ends beyond reach. (The captions and the text of the paper
-differ in which letter is which; these are the letters of its Section 2.1.)
+The six scenarios of Figs. 3 and 4 of the SLRB paper: activity grows near a wall, decreases farther
+away, and is 0 beyond reach. (The captions and the text of the paper use different letters; these
+are the letters of its Section 2.1.)
 """
 
 import json
@@ -25,16 +25,16 @@ from neuroslam.worlds.rodent import roam
 SPEED_M_S = 0.15
 RATE_HZ = 100.0
 FIRES = 0.1
-"""A cell whose rate is below this is silent; the largest is 1."""
+"""Rate above which a cell counts as firing; the largest rate is 1."""
 
 _BIN_M = 0.04
 
 _CORNER = 0.975
-_CURVE = 0.5, math.sqrt(0.975**2 - 0.5**2)  # y of the way; x where it is 2.5 cm from the wall
+_CURVE = 0.5, math.sqrt(0.975**2 - 0.5**2)  # y of the path; x at 2.5 cm from the wall
 
 
 class Scenario(NamedTuple):
-    """A straight way in a named arena; its letter is the paper's."""
+    """A straight path in a named arena, with its letter in the paper."""
 
     letter: str
     motion: str
@@ -48,33 +48,33 @@ SCENARIOS = (
     Scenario("C", "away from a wall", "square", (0.975, 0.0), (0.55, 0.0)),
     Scenario("D", "towards a corner", "square", (0.55, 0.55), (_CORNER, _CORNER)),
     Scenario("B", "away from a corner", "square", (_CORNER, _CORNER), (0.55, 0.55)),
-    Scenario("F", "towards a curved wall", "circle2m", (0.2, _CURVE[0]), _CURVE[::-1]),
-    Scenario("E", "away from a curved wall", "circle2m", _CURVE[::-1], (0.2, _CURVE[0])),
+    Scenario("F", "towards a curved wall", "circle2m", (0.2, _CURVE[0]), (_CURVE[1], _CURVE[0])),
+    Scenario("E", "away from a curved wall", "circle2m", (_CURVE[1], _CURVE[0]), (0.2, _CURVE[0])),
 )
 
 MAPPED = ((0, 0), (0, 3), (0, 5), (3, 3))
-"""Cells whose firing is mapped: numbers of the preferred bearing and of the preferred distance."""
+"""Cells with a rate map: numbers of the preferred bearing and of the preferred distance."""
 
 
 def boundary_scenarios(
     data_folder: Path | None, out_folder: Path, minutes: float = 30.0
 ) -> dict[str, Any]:
-    """Run the six scenarios, and map the firing of boundary cells in a square and a circle.
+    """Run the six scenarios, and make rate maps of boundary cells in a square and a circle.
 
     Args:
-        data_folder: Not needed.
+        data_folder: Not used.
         out_folder: ``results.json``, ``scenarios.png`` and ``firing_maps.png`` are written there.
-        minutes: Length of the walks that the firing maps are made of.
+        minutes: Length of the walks for the rate maps.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each scenario.
     """
     out = Path(out_folder)
     approaches = [walk_straight(scenario) for scenario in SCENARIOS]
-    title = f"Boundary cells on the way to and from walls, at {SPEED_M_S:g} m/s"
+    title = f"Boundary cells on paths towards and away from walls, at {SPEED_M_S:g} m/s"
     save(plot_approaches(approaches, title), out / "scenarios.png")
     maps = [map_firing(name, minutes) for name in ("square", "circle2m")]
-    title = f"Where four boundary cells fire in {minutes:g} minutes of roaming"
+    title = f"Rate maps of four boundary cells over {minutes:g} minutes"
     save(plot_firing_maps(maps, title, "mean rate (1 at most)"), out / "firing_maps.png")
     return write_results(
         out,
@@ -93,7 +93,7 @@ def boundary_scenarios(
 
 
 def walk_straight(scenario: Scenario, config: BoundaryCellConfig | None = None) -> Approach:
-    """Go along the way of a scenario without noise, from rest, and record the boundary cells."""
+    """Follow the path of a scenario without noise, from rest, and record the boundary cells."""
     config = config or BoundaryCellConfig()
     start, end = np.array(scenario.start_m), np.array(scenario.end_m)
     n = 1 + round(float(np.hypot(*(end - start))) / SPEED_M_S * RATE_HZ)
@@ -117,7 +117,7 @@ def walk_straight(scenario: Scenario, config: BoundaryCellConfig | None = None) 
 def respond(
     distance_m: np.ndarray, bearing_rad: np.ndarray, dt_s: float, config: BoundaryCellConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Let boundary cells feel walls, ``(t, n_walls)``, one time after the other.
+    """Run boundary cells on sensed walls, ``(t, n_walls)``, in order of time.
 
     Returns:
         Activity ``(t,)`` and rates ``(t, n_bearings, n_distances)``.
@@ -131,7 +131,7 @@ def respond(
 
 
 def measure(scenario: Scenario, approach: Approach) -> dict[str, Any]:
-    """Say how long the animal was in each zone, and what the activity did there."""
+    """Return the time in each zone, and the change of the activity there."""
     change = np.diff(approach.activity, prepend=0.0)
     zone = approach.zone
     rise, fall = change[zone == GROWTH], change[zone == ATTENUATION]
@@ -150,7 +150,7 @@ def measure(scenario: Scenario, approach: Approach) -> dict[str, Any]:
 
 
 def map_firing(name: str, minutes: float, seed: int = 0) -> list[Firing]:
-    """Let an animal roam in a named arena and map the firing of some of its boundary cells."""
+    """Simulate an animal in a named arena and return rate maps of some of its boundary cells."""
     arena, config = named_arena(name), BoundaryCellConfig()
     walk = roam(arena, minutes, np.random.default_rng(seed), speed_m_s=SPEED_M_S)
     walls = arena.nearest_walls(walk.positions, config.reach_m, 2)
@@ -172,7 +172,7 @@ def map_firing(name: str, minutes: float, seed: int = 0) -> list[Firing]:
 
 
 def write_results(out: Path, results: dict[str, Any]) -> dict[str, Any]:
-    """Write ``results.json``, with ``null`` for what is not a number, and return the results."""
+    """Write ``results.json``, with ``null`` for NaN, and return the results."""
     text = json.dumps(results, indent=1).replace("NaN", "null") + "\n"
     write_atomically(out / "results.json", lambda path: path.write_text(text, encoding="utf-8"))
     return results

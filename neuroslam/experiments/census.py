@@ -1,4 +1,4 @@
-"""A census of grid cells while animals walk: firing maps, scores and fields at some times."""
+"""A census of grid cells during a walk: rate maps, grid scores and fields at some times."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps, fields
-from neuroslam.experiments.animals import live
+from neuroslam.experiments.animals import arena_of, simulate
 from neuroslam.figures.cells import Firing
 from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import SenseNoise
@@ -20,15 +20,15 @@ _PIECE = 1200  # steps whose rates are held before they are added to the maps
 
 
 class Census(NamedTuple):
-    """Grid cells at some time, arrays of seeds by modules by cells.
+    """Grid cells at some time; arrays of seeds by modules by cells.
 
     Attributes:
-        time_s: Since the start.
-        silent: Score of the map since the start, unvisited bins silent.
+        time_s: Time since the start.
+        silent: Grid score of the map since the start, unvisited bins silent.
         skip: The same, unvisited bins left out.
-        last: Score of the map since the census before, unvisited bins silent.
-        n_fields: Firing fields.
-        maps: Of the first seed, modules by cells, ``(m, c, n_y, n_x)``.
+        last: Grid score of the map since the previous census, unvisited bins silent.
+        n_fields: Number of firing fields.
+        maps: Rate maps of the first seed, modules by cells, ``(m, c, n_y, n_x)``.
     """
 
     time_s: float
@@ -39,13 +39,13 @@ class Census(NamedTuple):
     maps: np.ndarray
 
 
-class Gatherer:
-    """Makes firing maps of a batch of animals on one walk, and takes a census at some times.
+class CensusRecorder:
+    """Recorder of rate maps of a batch of animals on one walk, with a census at some times.
 
     Args:
-        walk: Where they truly are.
-        times_s: Of a census, since the start, rising.
-        shape: Seeds, modules, cells.
+        walk: The true walk.
+        times_s: Times of a census since the start, rising.
+        shape: Number of seeds, modules, cells.
     """
 
     def __init__(self, walk: Walk, times_s: Sequence[float], shape: tuple[int, int, int]) -> None:
@@ -61,7 +61,7 @@ class Gatherer:
         return [RateMaps(self.bins, self.shape[1] * self.shape[2]) for _ in range(self.shape[0])]
 
     def add(self, step: int, rates: np.ndarray) -> None:
-        """Add the rates at a step, of as many numbers as seeds by modules by cells."""
+        """Add the rates at a step: as many numbers as seeds by modules by cells."""
         self.held.append(np.array(rates, np.float32).reshape(self.shape[0], -1))
         due = len(self.census) < len(self.stops) and step == self.stops[len(self.census)]
         if due or len(self.held) == _PIECE:
@@ -78,31 +78,38 @@ class Gatherer:
         last = np.stack([one.maps() for one in self.recent]) if self.census else maps
         n_fields = np.stack([fields(one, self.bins.bin_m).n_fields for one in maps])
         silent, skip = gridness(maps, "silent"), gridness(maps, "skip")
-        scores = silent, skip, gridness(last, "silent") if self.census else silent, n_fields
-        time_s = self.times_s[len(self.census)]
-        of_first = maps[0].reshape(*self.shape[1:], *self.bins.shape)
-        self.census.append(Census(time_s, *(x.reshape(self.shape) for x in scores), of_first))
+        recent = gridness(last, "silent") if self.census else silent
+        self.census.append(
+            Census(
+                self.times_s[len(self.census)],
+                silent.reshape(self.shape),
+                skip.reshape(self.shape),
+                recent.reshape(self.shape),
+                n_fields.reshape(self.shape),
+                maps[0].reshape(*self.shape[1:], *self.bins.shape),
+            )
+        )
         self.recent = self._empty()
 
 
 def arena_bins(walk: Walk) -> Bins:
     """Cover the arena of a walk with bins of 2.5 cm."""
-    return Bins.around(np.reshape(walk.arena.bounds, (2, 2)).T)
+    return Bins.around(np.reshape(arena_of(walk).bounds, (2, 2)).T)
 
 
 def median(scores: np.ndarray) -> float:
-    """Median over modules and cells of each seed, averaged over the seeds."""
+    """Return the median over modules and cells, averaged over the seeds."""
     return float(np.mean(by_seed(scores)))
 
 
 def by_seed(scores: np.ndarray) -> np.ndarray:
-    """Median over modules and cells of each seed; NaN where no cell has a score."""
+    """Return the median over modules and cells of each seed; NaN where no cell has a score."""
     rows = scores.reshape(len(scores), -1)
-    known = np.isfinite(rows).any(axis=1)
+    known = np.any(np.isfinite(rows), axis=1)
     return np.array([np.nanmedian(r) if k else math.nan for r, k in zip(rows, known, strict=True)])
 
 
-def live_grid(
+def simulate_grid(
     walk: Walk,
     seeds: Sequence[int],
     times_s: Sequence[float],
@@ -110,41 +117,41 @@ def live_grid(
     noise: SenseNoise | None = None,
     watch: Callable[[int, NavigationCells], object] | None = None,
 ) -> tuple[list[Census], np.ndarray]:
-    """Let animals live through a walk; returns the census of their grid cells, and their errors.
+    """Simulate animals on a walk; return the census of their grid cells, and their errors.
 
     Args:
-        walk: In an arena.
-        seeds: One for each animal.
-        times_s: Of the census.
-        config: Of the cells; ``None``: the defaults.
-        noise: Of the senses; ``None``: the defaults.
-        watch: Called after every step, with its number and the cells.
+        walk: A walk in an arena.
+        seeds: Seed of the noise of each animal.
+        times_s: Times of the census.
+        config: Config of the cells; ``None``: the defaults.
+        noise: Noise of the senses; ``None``: the defaults.
+        watch: Called after every step with its number and the cells.
 
     Returns:
         The census, and the errors of position in metres, ``(seeds, steps)``.
     """
     config = config or BrainConfig()
     shape = (len(seeds), len(config.grid_cells.spacings_m), config.grid_cells.n_cells)
-    gatherer = Gatherer(walk, times_s, shape)
+    recorder = CensusRecorder(walk, times_s, shape)
 
     def hook(step: int, _here: NavigationEstimate, cells: NavigationCells) -> None:
-        gatherer.add(step, cells.grid.rates.numpy())
+        recorder.add(step, cells.grid.rates.numpy())
         if watch is not None:
             watch(step, cells)
 
-    life = live(walk, seeds, config, noise, hook)
-    return gatherer.census, np.linalg.norm(life.estimate_m - walk.positions, axis=-1)
+    simulation = simulate(walk, seeds, config, noise, hook)
+    return recorder.census, np.linalg.norm(simulation.estimate_m - walk.positions, axis=-1)
 
 
 def median_cell(census: Census, module: int) -> int:
-    """Find the cell of a module, of the first seed, whose score is in the middle."""
+    """Return the cell of a module, of the first seed, with the median score."""
     scores = census.silent[0, module]
     known = np.flatnonzero(np.isfinite(scores))
     return int(known[np.argsort(scores[known])[len(known) // 2]]) if len(known) else 0
 
 
 def map_of(walk: Walk, census: Census, module: int, cell: int, title: str) -> Firing:
-    """Return the firing map of a cell of the first seed, to be drawn, with its score."""
+    """Return the rate map of a cell of the first seed, with its score, for a figure."""
     note = f"score {census.silent[0, module, cell]:.2f}"
     rate_map = census.maps[module, cell]
-    return Firing(title, note, rate_map, arena_bins(walk), walk.arena)
+    return Firing(title, note, rate_map, arena_bins(walk), arena_of(walk))

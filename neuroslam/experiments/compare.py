@@ -1,4 +1,4 @@
-"""All methods side by side: one world, one noise, one seed, and the same frames for each."""
+"""Comparison of all methods on the same worlds, noise, seeds and frames."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +22,7 @@ from neuroslam.types import NO_EXPERIENCE, Frame, Pose
 
 WORLDS = ("corridor", "ellipse")
 SENSES = "noise=0.05&compass_deg=3&ranges=72&markers=12&landmark_reach=6"
-"""What all methods have in common; each takes of it what it has cells for."""
+"""Sensors of all drives; each method uses those that it has cells for."""
 
 _NEURONS = {
     "time_step_s": 0.001,
@@ -43,7 +43,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "RatSLAM and SLRB": {"cells": "pose+place"},
     "full": {},
 }
-"""Name -> what differs from the preset ``full``, in which landmarks are only those of a sensor."""
+"""Name -> differences from the preset ``full``; landmarks come from a sensor only."""
 
 LOSSES = {
     "nothing is lost": "",
@@ -60,19 +60,19 @@ LANDMARKS = {
     "markers in pictures": ("", ["markers"]),
     "known views": ("", ["views"]),
 }
-"""Kind of landmarks -> options of the world, and which the brain takes."""
+"""Kind of landmarks -> options of the world, and ``semantic.landmarks`` of the brain."""
 
 _TESTED = ("RatSLAM", "SLRB", "SSP-SLAM, vectors", "full")
 
 
-class Life(NamedTuple):
-    """What a brain made of a drive.
+class DriveResult(NamedTuple):
+    """Accuracy and cost of a brain on a drive.
 
     Attributes:
-        error_m: Of each frame, on the final map laid rigidly over the truth.
-        places: Experiences of its map.
-        bytes: Of its state.
-        cpu_ms: Of one thread, a frame.
+        error_m: Error of each frame on the final map, after rigid alignment to the truth.
+        places: Experiences of the map.
+        bytes: Size of the state.
+        cpu_ms: CPU time of one thread per frame.
     """
 
     error_m: np.ndarray
@@ -82,27 +82,27 @@ class Life(NamedTuple):
 
     @property
     def ate_m(self) -> float:
-        """Absolute trajectory error, RMS."""
+        """Absolute trajectory error (RMSE after rigid alignment)."""
         return float(np.sqrt(np.mean(self.error_m**2)))
 
 
 class Drive(NamedTuple):
-    """Frames that several brains take in.
+    """A drive for several brains.
 
     Attributes:
-        source: Where they are from.
-        configs: Of the brains, by name.
+        source: Spec of the source.
+        configs: Name of a brain -> its config.
     """
 
     source: str
     configs: Mapping[str, BrainConfig]
 
 
-def drive(what: Drive) -> tuple[float, dict[str, Life]]:
-    """Let brains take in the same frames; returns the error of odometry alone too, RMS in m."""
-    frames = list(open_source(what.source))
-    lives = {name: live(config, frames) for name, config in what.configs.items()}
-    return _rms(_off(_reckoned(frames), frames)), lives
+def run_drive(drive: Drive) -> tuple[float, dict[str, DriveResult]]:
+    """Run brains on the same frames; return the ATE of odometry alone (m), and their results."""
+    frames = list(open_source(drive.source))
+    results = {name: run_brain(config, frames) for name, config in drive.configs.items()}
+    return _rms(_errors_m(_dead_reckoned(frames), frames)), results
 
 
 def compare(
@@ -116,18 +116,18 @@ def compare(
     jobs: int | None = None,
     ray: str | None = None,
 ) -> dict[str, Any]:
-    """Compare all methods in rendered worlds, and what is left of each when a sense is lost.
+    """Compare all methods in rendered worlds, with all sensors and with a failing sensor.
 
     Args:
-        _data_folder: It needs none.
+        _data_folder: Not used.
         out_folder: ``results.json``, ``comparison.png`` and ``losses.png`` are written there.
         worlds: Names of rendered worlds.
-        seeds: Of the noise; one drive for each.
-        laps: Of each drive; drives that lose a sense are six laps of the first world.
-        methods: Of ``METHODS``.
-        losses: Of ``LOSSES``.
-        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives side by side.
-        ray: The same.
+        seeds: Seed of the noise of each drive.
+        laps: Laps of each drive; drives with a failing sensor are six laps of the first world.
+        methods: Names in ``METHODS``.
+        losses: Names in ``LOSSES``.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives in parallel.
+        ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each world and method, and ``losses``.
@@ -140,28 +140,28 @@ def compare(
         for world in worlds
         for seed in seeds
     ]
-    driven = iter(parallel_map(drive, drives, jobs, ray))
+    driven = iter(parallel_map(run_drive, drives, jobs, ray))
     for world in worlds:
-        alone, told = zip(*islice(driven, len(seeds)), strict=True)
-        lives = {name: [of[name] for of in told] for name in methods}
+        alone, driven_results = zip(*islice(driven, len(seeds)), strict=True)
+        results = {name: [of[name] for of in driven_results] for name in methods}
         rows.append(_row(world, "odometry alone", list(alone)))
         rows += [
             _row(
-                world, name, [life.ate_m for life in each],
-                places=round(np.mean([life.places for life in each])),
-                kilobytes=round(np.mean([life.bytes for life in each]) / 1000.0),
-                cpu_ms=float(np.median([life.cpu_ms for life in each])),
+                world, name, [result.ate_m for result in each],
+                places=round(np.mean([result.places for result in each])),
+                kilobytes=round(np.mean([result.bytes for result in each]) / 1000.0),
+                cpu_ms=float(np.median([result.cpu_ms for result in each])),
             )
-            for name, each in lives.items()
+            for name, each in results.items()
         ]  # fmt: skip
     tested = {name: configs[name] for name in _TESTED if name in methods}
     drives = [
         Drive(f"world:{worlds[0]}?{SENSES}&laps=6&seed={seeds[0]}&{LOSSES[loss]}", tested)
         for loss in losses
     ]
-    lost = dict(zip(losses, parallel_map(drive, drives, jobs, ray), strict=True))
+    lost = dict(zip(losses, parallel_map(run_drive, drives, jobs, ray), strict=True))
     curves = {
-        loss: {name: life.error_m for name, life in each.items()}
+        loss: {name: result.error_m for name, result in each.items()}
         for loss, (_, each) in lost.items()
     }
     save(plot_comparison(rows), out / "comparison.png")
@@ -180,22 +180,22 @@ def pixel_landmarks(
     jobs: int | None = None,
     ray: str | None = None,
 ) -> dict[str, Any]:
-    """Compare landmarks that a sensor tells with such that are found in the pictures.
+    """Compare landmarks measured by a sensor with landmarks detected in pictures.
 
     Args:
-        _data_folder: It needs none.
+        _data_folder: Not used.
         out_folder: ``results.json`` is written there.
-        seeds: Of the noise; one drive for each.
-        laps: Of each drive.
-        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives side by side.
-        ray: The same.
+        seeds: Seed of the noise of each drive.
+        laps: Laps of each drive.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: drives in parallel.
+        ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each kind of landmarks and set of cells.
     """
     rows, drives = [], []
     for kind, (options, landmarks) in LANDMARKS.items():
-        # Who knows views has pose cells.
+        # Known views need pose cells.
         some = ("pose+semantic",) if kind == "known views" else ("semantic", "pose+semantic")
         over = {"semantic": {"landmarks": landmarks}}
         full = merge_values(read_preset("full"), over)
@@ -203,12 +203,17 @@ def pixel_landmarks(
         drives += [
             Drive(f"{_MARKED}&laps={laps:g}&seed={seed}&{options}", configs) for seed in seeds
         ]
-    driven = iter(parallel_map(drive, drives, jobs, ray))
+    driven = iter(parallel_map(run_drive, drives, jobs, ray))
     for kind in LANDMARKS:
-        told = [lives for _, lives in islice(driven, len(seeds))]
+        driven_results = [results for _, results in islice(driven, len(seeds))]
         rows += [
-            _row("corridor", cells, [lives[cells].ate_m for lives in told], landmarks=kind)
-            for cells in told[0]
+            _row(
+                "corridor",
+                cells,
+                [results[cells].ate_m for results in driven_results],
+                landmarks=kind,
+            )
+            for cells in driven_results[0]
         ]
     results = {"rows": rows}
     write_results(Path(out_folder), results)
@@ -216,22 +221,22 @@ def pixel_landmarks(
 
 
 def config_of(method: str) -> BrainConfig:
-    """Return the config of a method: the preset ``full``, and what differs."""
-    told = merge_values(read_preset("full"), {"semantic": {"landmarks": ["given"]}})
-    return build_config(merge_values(told, METHODS[method]), method)
+    """Return the config of a method: the preset ``full`` with the method's differences."""
+    base = merge_values(read_preset("full"), {"semantic": {"landmarks": ["given"]}})
+    return build_config(merge_values(base, METHODS[method]), method)
 
 
-def live(
+def run_brain(
     config: BrainConfig,
     frames: Sequence[Frame],
     prepare: Callable[[NavigationBrain], None] | None = None,
-) -> Life:
-    """Let a brain take in a drive; the time is that of the brain alone.
+) -> DriveResult:
+    """Run a brain on a drive; the CPU time is that of the brain only.
 
     Args:
         config: Of the brain.
         frames: Of the drive.
-        prepare: What is done to the brain before it.
+        prepare: Changes the brain before its first frame.
     """
     brain, at, cpu_s = NavigationBrain(config), [], 0.0
     if prepare is not None:
@@ -246,17 +251,17 @@ def live(
     size = sum(value.numel() * value.element_size() for value in brain.state_dict().values())
     first = next(k for k, (experience, _) in enumerate(at) if experience != NO_EXPERIENCE)
     off = np.zeros(len(frames))
-    off[first:] = _off(track[first:], frames[first:])
-    return Life(off, brain.map.n, size, 1000.0 * cpu_s / len(frames))
+    off[first:] = _errors_m(track[first:], frames[first:])
+    return DriveResult(off, brain.map.n, size, 1000.0 * cpu_s / len(frames))
 
 
-def _off(track: np.ndarray, frames: Sequence[Frame]) -> np.ndarray:
-    truth = np.array([frame.truth[:2] for frame in frames])
+def _errors_m(track: np.ndarray, frames: Sequence[Frame]) -> np.ndarray:
+    truth = np.array([frame.truth[:2] for frame in frames if frame.truth is not None])
     moved = align(track[:, :2], truth, "rigid").apply(track[:, :2])
     return np.linalg.norm(moved - truth, axis=1)
 
 
-def _reckoned(frames: Sequence[Frame]) -> np.ndarray:
+def _dead_reckoned(frames: Sequence[Frame]) -> np.ndarray:
     times = np.array([frame.time_s for frame in frames])
     v, w = np.array([frame.velocity for frame in frames]).T
     return integrate_velocities(v, w, np.diff(times, prepend=times[0]), Pose(0.0, 0.0, 0.0))
@@ -266,7 +271,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _row(world: str, method: str, ates: list[float], **more: float) -> dict[str, Any]:
+def _row(world: str, method: str, ates: list[float], **more: float | str) -> dict[str, Any]:
     return {
         "world": world,
         "method": method,
@@ -278,7 +283,7 @@ def _row(world: str, method: str, ates: list[float], **more: float) -> dict[str,
 
 
 def _lost(curves: dict[str, dict[str, np.ndarray]]) -> list[dict[str, Any]]:
-    """Say how large errors of drives of six laps were, and in the last lap."""
+    """Return the errors of drives of six laps: of all frames, and of the last lap."""
     return [
         {
             "loss": loss,

@@ -1,18 +1,18 @@
-"""A map from odometry and scored loop matches alone: which matches to believe.
+"""A map from odometry and scored loop matches, most of which are outliers.
 
 Data: TUC SLAM, "Corridor" (P. Neubert, S. Schubert, P. Protzel, "A neurologically inspired sequence
 processing model for mobile robot place recognition", IEEE RA-L, 2019). A robot drives a corridor to
-and fro; odometry turns away by 250 degrees on the way; most matches are wrong. A match says that
-two instants show the same place. It does not say in which direction the robot looked: in the truth,
-right matches come with equal and with opposite headings. So least squares takes a match as a place
-only. The paper's relaxation corrects headings by facings alone; it gets RatSLAM's rule, that the
-same view is the same heading.
+and fro; the heading of odometry drifts by 250 degrees; most matches are wrong. A match states that
+two instants show the same place, but not the relative heading: in the truth, correct matches have
+equal or opposite headings. So least squares constrains only the position of a match. The paper's
+relaxation corrects headings by facings only; there a match has equal headings, as in RatSLAM.
 """
 
 import json
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -29,27 +29,27 @@ SCORES = (0.0, 0.5, 0.7, 0.8, 0.9)
 """Least scores of the matches that are used."""
 
 SPEED_SIGMA_M_S, TURN_SIGMA_RAD_S = 0.05, 0.01
-"""The recording's own standard deviations of speed and turn rate; held to last over a link."""
+"""Standard deviations of speed and turn rate in the recording, as errors constant over a link."""
 
 MATCH_SIGMA_M = 0.5
-"""Half the way between two experiences, about 0.9 m: as sharp as a match can be."""
+"""Half the distance of two experiences, about 0.9 m: the accuracy of a match."""
 
 RELAX_LOOPS, RELAX_REST = 5000, 1e-4
 """Longest relaxation, and the movement (m, rad) that ends it earlier."""
 
 WRONG_M = 5.0
-"""Ends of a match farther apart than this, in truth, make it wrong; only for the report."""
+"""True distance of the ends of a match above which it is wrong; used in the results only."""
 
 
 class Corridor(NamedTuple):
     """The recording.
 
     Attributes:
-        times_s: Instants of the odometry, ``(n,)``.
-        odometry: Its dead-reckoned poses, m and rad, ``(n, 3)``.
-        matches_s: Earlier and later instant of each match, ``(matches, 2)``.
-        scores: Their scores in [0, 1].
-        truth_s: Instants of the truth, ``(t,)``.
+        times_s: Times of the odometry, ``(n,)``.
+        odometry: Dead-reckoned poses, m and rad, ``(n, 3)``.
+        matches_s: Earlier and later time of each match, ``(matches, 2)``.
+        scores: Scores of the matches in [0, 1].
+        truth_s: Times of the truth, ``(t,)``.
         truth_m: True positions, ``(t, 2)``.
     """
 
@@ -62,7 +62,7 @@ class Corridor(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """Experiences at the instants that were matched; links of odometry, then matches.
+    """A pose graph: experiences at the times of matches; links of odometry, then matches.
 
     Attributes:
         frames: Odometry index of every experience, ``(n,)``.
@@ -95,7 +95,7 @@ def read_corridor(folder: Path) -> Corridor:
     """Read ``Corridor_Input.txt`` and ``Corridor_GT.txt``.
 
     Raises:
-        SourceError: If a file is missing or a line in it is not what it should be.
+        SourceError: If a file is missing or a line is invalid.
     """
     rows: dict[str, list[list[float]]] = {"odom2": [], "loop": [], "point2": [], "angle": []}
     for name in ("Corridor_Input.txt", "Corridor_GT.txt"):
@@ -103,7 +103,9 @@ def read_corridor(folder: Path) -> Corridor:
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except OSError:
-            raise SourceError(f"corridor_loops: {path} cannot be read; it holds TUC SLAM") from None
+            raise SourceError(
+                f"corridor_loops: {path} cannot be read; expected a file of TUC SLAM's Corridor"
+            ) from None
         for number, line in enumerate(lines, start=1):
             try:
                 kind, *values = line.split()
@@ -126,7 +128,7 @@ def read_corridor(folder: Path) -> Corridor:
 
 
 def build_graph(corridor: Corridor, least_score: float) -> Graph:
-    """Make an experience of every instant in any match, and links of the matches scored enough."""
+    """Return a graph with an experience at the time of every match, and links of good matches."""
     matched = np.searchsorted(corridor.times_s[:-1], corridor.matches_s - 0.05)
     frames = np.unique(np.append(matched, 0))
     poses = corridor.odometry[frames]
@@ -155,7 +157,7 @@ def solve(graph: Graph, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Solve the map by ``odometry``, ``relax``, ``least_squares`` or ``least_squares_robust``.
 
     Returns:
-        Poses of the experiences, and which links were believed.
+        Poses of the experiences, and which links have a weight above 0.
     """
     links = graph.source, graph.target, graph.distance_m, graph.heading_rad
     if method == "odometry":
@@ -177,7 +179,7 @@ def solve(graph: Graph, method: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def track_at_truth(corridor: Corridor, graph: Graph, poses: np.ndarray) -> np.ndarray:
-    """Positions on the solved map at the truth's instants, ``(t, 2)``; a frame keeps its offset."""
+    """Return positions on the solved map at the times of the truth, ``(t, 2)``."""
     own = np.searchsorted(graph.frames, np.arange(len(corridor.times_s)), side="right") - 1
     turn = (poses[:, 2] - graph.poses[:, 2])[own]
     offset = corridor.odometry[:, :2] - graph.poses[own, :2]
@@ -188,26 +190,26 @@ def track_at_truth(corridor: Corridor, graph: Graph, poses: np.ndarray) -> np.nd
     )
 
 
-def corridor_loops(data_folder: Path, out_folder: Path) -> dict:
+def corridor_loops(data_folder: Path, out_folder: Path) -> dict[str, Any]:
     """Map the corridor with each method from each subset of the matches.
 
-    Writes ``results.json`` (one row a method and subset) and ``corridor_loops.png``. The truth
-    serves to report only: no method sees it. ATE is the RMSE after a rigid alignment.
+    Writes ``results.json`` (one row per method and subset) and ``corridor_loops.png``. The truth is
+    used for the results only. ATE is the RMSE after rigid alignment.
 
     Args:
         data_folder: Holds ``Corridor_Input.txt`` and ``Corridor_GT.txt``.
-        out_folder: Where to write.
+        out_folder: Folder to write.
 
     Returns:
-        What ``results.json`` holds.
+        The content of ``results.json``.
 
     Raises:
         SourceError: If the data cannot be read.
     """
     corridor = read_corridor(data_folder)
     rows, tracks = [], {}
-    for least_score in SCORES:
-        graph = build_graph(corridor, least_score)
+    graphs = {score: build_graph(corridor, score) for score in SCORES}
+    for least_score, graph in graphs.items():
         true_m = np.column_stack(
             [
                 np.interp(corridor.times_s[graph.frames], corridor.truth_s, axis)
@@ -218,8 +220,8 @@ def corridor_loops(data_folder: Path, out_folder: Path) -> dict:
         wrong = graph.is_match & (apart_m > WRONG_M)
         for method in ("odometry", "relax", "least_squares", "least_squares_robust"):
             began_s = time.process_time()
-            poses, believed = solve(graph, method)
-            took_s = time.process_time() - began_s
+            poses, used = solve(graph, method)
+            cpu_s = time.process_time() - began_s
             track = track_at_truth(corridor, graph, poses)
             tracks[method, least_score] = track
             rows.append(
@@ -228,15 +230,15 @@ def corridor_loops(data_folder: Path, out_folder: Path) -> dict:
                     "least_score": least_score,
                     "matches": int(graph.is_match.sum()),
                     "wrong_matches": int(wrong.sum()),
-                    "believed_matches": int((graph.is_match & believed).sum()),
-                    "wrong_believed_matches": int((wrong & believed).sum()),
+                    "believed_matches": int((graph.is_match & used).sum()),
+                    "wrong_believed_matches": int((wrong & used).sum()),
                     "ate_rmse_m": absolute_trajectory_error(track, corridor.truth_m).rmse,
-                    "cpu_s": round(took_s, 3),
+                    "cpu_s": round(cpu_s, 3),
                 }
             )
     results = {
         "experiment": "corridor_loops",
-        "experiences": len(graph.frames),
+        "experiences": len(graphs[SCORES[-1]].frames),
         "track_instants": len(corridor.truth_s),
         "rows": rows,
     }
@@ -250,21 +252,25 @@ def corridor_loops(data_folder: Path, out_folder: Path) -> dict:
 
 LOOKS = {
     "odometry": ("odometry alone", ODOMETRY),
-    "relax": ("relax, all matches believed", OTHER),
-    "least_squares": ("least squares, all matches believed", LOOP),
-    "least_squares_robust": ("least squares, matches admitted by degrees", MAP),
+    "relax": ("relaxation, all matches", OTHER),
+    "least_squares": ("least squares, all matches", LOOP),
+    "least_squares_robust": ("robust least squares, outliers rejected", MAP),
 }
 
 
-def draw(truth_m: np.ndarray, tracks: dict[tuple[str, float], np.ndarray], rows: list) -> Figure:
-    """Draw the paths found from all matches, and the error against the subset used."""
+def draw(
+    truth_m: np.ndarray,
+    tracks: dict[tuple[str, float], np.ndarray],
+    rows: Sequence[Mapping[str, Any]],
+) -> Figure:
+    """Draw the paths estimated from all matches, and the error over the subset of matches."""
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     paths, errors = figure.subplots(1, 2, width_ratios=(1.25, 1))
     least_score = min(score for _, score in tracks)
     for method, (label, colour) in LOOKS.items():
         track = tracks[method, least_score]
         track = align(track, truth_m).apply(track)
-        behind = method == "least_squares"  # both maps that believe all fold up on one spot
+        behind = method == "least_squares"  # both maps from all matches collapse to one position
         paths.plot(
             *track.T, color=colour, lw=1.2 - 0.6 * behind, zorder=1.5 + (not behind), label=label
         )
@@ -273,14 +279,14 @@ def draw(truth_m: np.ndarray, tracks: dict[tuple[str, float], np.ndarray], rows:
         aspect="equal",
         xlabel="x (m)",
         ylabel="y (m)",
-        title="Paths from all matches: to believe each folds the map up",
+        title="Paths from all matches; without outlier rejection the map collapses",
     )
     paths.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False)
     for method, (label, colour) in LOOKS.items():
         own = [row for row in rows if row["method"] == method]
         errors.plot([row["ate_rmse_m"] for row in own], "o-", color=colour, label=label)
     errors.axhline(rows[0]["ate_rmse_m"] / 5, color="0.3", lw=1, ls="--")
-    errors.text(4, rows[0]["ate_rmse_m"] / 5 * 1.05, "a fifth of odometry's", ha="right")
+    errors.text(4, rows[0]["ate_rmse_m"] / 5 * 1.05, "a fifth of the error of odometry", ha="right")
     names = [
         f"{'all' if row['least_score'] == 0 else '≥ ' + str(row['least_score'])}\n"
         f"{row['matches']}\n{100 * row['wrong_matches'] / row['matches']:.0f} %"
@@ -291,9 +297,9 @@ def draw(truth_m: np.ndarray, tracks: dict[tuple[str, float], np.ndarray], rows:
     errors.set(
         yscale="log",
         ylim=(1.5, 100),
-        xlabel="score of the matches used, their number, share that is wrong",
-        ylabel="ATE (m, RMSE)",
-        title="Error of the map by subset of the matches",
+        xlabel="least score of the matches used, their number, share of wrong matches",
+        ylabel="ATE, rigid alignment (m, RMSE)",
+        title="Error of the map over the subset of matches",
     )
     errors.set_yticks([2, 5, 10, 20, 50, 100], ["2", "5", "10", "20", "50", "100"])
     errors.minorticks_off()

@@ -1,7 +1,7 @@
-"""How hexagonal grid cells are in arenas of three shapes, beside a grid cell recorded in a rat.
+"""Grid scores of grid cells in arenas of three shapes, and of a grid cell recorded in a rat.
 
-The score of a time is that of the firing map of everything from the start until then. Both ways of
-scoring a map that is not a rectangle are given, see :func:`neuroslam.evaluation.gridness.gridness`.
+The score at a time is that of the rate map since the start. The results have both treatments of
+unvisited bins of a map, see :func:`neuroslam.evaluation.gridness.gridness`.
 """
 
 import math
@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 
 from neuroslam.config import BrainConfig, GridCellConfig
+from neuroslam.errors import SourceError
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import spike_map
-from neuroslam.experiments.animals import TRACKS, read_track
+from neuroslam.experiments.animals import TRACKS, arena_of, read_track
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.census import (
     Census,
     arena_bins,
     by_seed,
-    live_grid,
     map_of,
     median,
     median_cell,
+    simulate_grid,
 )
 from neuroslam.figures.cells import Curve, Firing, plot_firing, plot_scores
 from neuroslam.figures.style import CURVES, MAP, TRUTH, save
@@ -36,7 +37,7 @@ PAPER_TABLE_1 = {
 }
 """Scores at 30, 60, ..., 360 s."""
 
-_SHOWN = 1  # module whose cells are drawn: fields 0.46 m apart
+_SHOWN = 1  # module of the cells that are drawn, with a spacing of 0.46 m
 
 
 def grid_scores(
@@ -46,13 +47,13 @@ def grid_scores(
     n_seeds: int = 5,
     grid: GridCellConfig | None = None,
 ) -> dict[str, Any]:
-    """Score grid cells in a triangle, a pentagon and a nonagon as time goes by (Table 1, Fig. 5).
+    """Score grid cells in a triangle, a pentagon and a nonagon over time (Table 1, Fig. 5).
 
     Args:
         data_folder: Holds the simulated tracks, and the recording with a grid cell's spikes.
         out_folder: ``results.json``, ``scores.png`` and ``firing.png`` are written there.
-        minutes: How long; the paper has 6.
-        n_seeds: Animals, which differ in their noise.
+        minutes: Duration; 6 in the paper.
+        n_seeds: Number of animals, which differ in their noise.
         grid: Modules of grid cells, two or more; ``None``: the defaults.
 
     Returns:
@@ -64,7 +65,7 @@ def grid_scores(
     for name, paper in PAPER_TABLE_1.items():
         walk = read_track(data, name, minutes)
         fired: list[np.ndarray] = []
-        census, _ = live_grid(
+        census, _ = simulate_grid(
             walk,
             range(n_seeds),
             times,
@@ -97,10 +98,10 @@ def grid_scores(
         cells.append(_show(walk, census[-1], np.stack(fired), name.capitalize()))
     recorded, row = recorded_cell(data)
     save(
-        plot_scores(panels, "time (s)", "Grid scores while an arena is explored"),
+        plot_scores(panels, "time (s)", "Grid scores during the exploration of an arena"),
         out / "scores.png",
     )
-    title = "A grid cell in each arena, and one recorded in a rat (right)"
+    title = "Firing of a grid cell in each arena, and of one recorded in a rat (right)"
     save(plot_firing([*cells, recorded], title), out / "firing.png")
     return write_results(
         out,
@@ -137,7 +138,7 @@ def _table_1_curves(
 
 
 def _show(walk: Walk, census: Census, rates: np.ndarray, title: str) -> Firing:
-    """Draw a cell of the mapped module, whose rates were ``(steps, cells)``, as it fired."""
+    """Return the median cell of the drawn module, with rates ``(steps, cells)``, for a figure."""
     cell = median_cell(census, _SHOWN)
     fires = rates[:, cell] > 0.5 * rates[:, cell].max()
     firing = map_of(walk, census, _SHOWN, cell, title)
@@ -145,19 +146,26 @@ def _show(walk: Walk, census: Census, rates: np.ndarray, title: str) -> Firing:
 
 
 def recorded_cell(data: Path) -> tuple[Firing, dict[str, Any]]:
-    """Score the recorded grid cell; returns what to draw, and its row."""
+    """Score the recorded grid cell; return its rate map for a figure, and its row.
+
+    Raises:
+        SourceError: If the recording has no spikes.
+    """
     walk = read_walk(data / TRACKS["sargolini"])
+    spikes = walk.spikes_s
+    if spikes is None:
+        raise SourceError(f"{TRACKS['sargolini']}: has no spikes_s; expected times of spikes")
     bins = arena_bins(walk)
-    rate_map = spike_map(walk.positions, walk.times_s, walk.spikes_s, bins)
-    silent, skip = (float(gridness(rate_map, mode)) for mode in ("silent", "skip"))
-    at = [np.interp(walk.spikes_s, walk.times_s, axis) for axis in walk.positions.T]
+    rate_map = spike_map(walk.positions, walk.times_s, spikes, bins)
+    silent, skip = float(gridness(rate_map, "silent")), float(gridness(rate_map, "skip"))
+    at = [np.interp(spikes, walk.times_s, axis) for axis in walk.positions.T]
     note = f"score {silent:.2f}"
     firing = Firing(
-        "Recorded", note, rate_map, bins, walk.arena, walk.positions, np.column_stack(at)
+        "Recorded", note, rate_map, bins, arena_of(walk), walk.positions, np.column_stack(at)
     )
     return firing, {
         "recording": TRACKS["sargolini"],
-        "spikes": len(walk.spikes_s),
+        "spikes": len(spikes),
         "gridness_silent": silent,
         "gridness_skip": skip,
         "opexebo_on_a_map_of_its_own": 0.67,
@@ -165,11 +173,11 @@ def recorded_cell(data: Path) -> tuple[Firing, dict[str, Any]]:
 
 
 def count_directions(data: Path, minutes: float, grid: GridCellConfig) -> list[dict[str, Any]]:
-    """Score grid cells that learnt from 6, 12 and 36 directions, in the pentagon, one seed."""
+    """Score grid cells trained with 6, 12 and 36 directions, in the pentagon, one seed."""
     walk, rows = read_track(data, "pentagon", minutes), []
     for directions in (6, 12, 36):
         config = BrainConfig(grid_cells=grid.model_copy(update={"directions": directions}))
-        (census,), _ = live_grid(walk, [0], [walk.duration_s], config)
+        (census,), _ = simulate_grid(walk, [0], [walk.duration_s], config)
         silent, skip = by_seed(census.silent[0]), by_seed(census.skip[0])
         rows.append(
             {

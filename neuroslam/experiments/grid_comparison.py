@@ -1,8 +1,8 @@
-"""Grid cells beside those of two other models, on a rat's track under one noise, over time.
+"""Comparison of grid cells with two other models, on a rat's track with the same noise, over time.
 
-The score of a time is that of the firing map of everything from the start until then, over the
-true positions; where it says ``last``, since the census before, which tells a grid that drifts from
-one whose early map outweighs what came later.
+The score at a time is that of the rate map over true positions since the start. Scores named
+``last`` are of the rate map since the previous census: they show drift that the early part of the
+whole map hides.
 """
 
 import math
@@ -17,17 +17,17 @@ from matplotlib.figure import Figure
 from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.sheet import GridSheet, SheetParameters
-from neuroslam.config import BrainConfig, GridCellConfig
-from neuroslam.experiments.animals import WALLS, read_track
+from neuroslam.config import BrainConfig, GridCellConfig, WallMemoryConfig
+from neuroslam.experiments.animals import WALLS, arena_of, read_track
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.experiments.census import (
     Census,
-    Gatherer,
+    CensusRecorder,
     by_seed,
-    live_grid,
     map_of,
     median,
     median_cell,
+    simulate_grid,
 )
 from neuroslam.figures.cells import Curve, Firing, plot_encounters, plot_grids, plot_scores
 from neuroslam.figures.style import CURVES, LOOP, MAP, ROBOT, TRUTH, save
@@ -38,7 +38,7 @@ PAPER_TABLE_2 = {
     "cells": (103, 195, 274, 318, 378, 421, 472, 503, 498),
     "error_m": (0.67, 0.71, 0.83, 0.86, 0.74, 0.61, 0.50, 0.39, 0.37),
 }
-"""Activated boundary cells and mean localization error at 200, 400, ..., 1800 s."""
+"""Activated boundary cells and mean localisation error at 200, 400, ..., 1800 s."""
 
 PAPER_TABLE_3 = {
     "OI": ((0.71, 0.73, 0.68, 0.54, 0.51, 0.43), (171, 382, 410, 472, 524, 614)),
@@ -50,9 +50,9 @@ PAPER_TABLE_3 = {
 MODULES = GridCellConfig(
     spacings_m=(0.30, 0.35, 0.46, 0.60, 0.78), orientations_deg=(-20.0, 0.0, 15.0, -10.0, 7.0)
 )
-"""The default modules, and one of 0.30 m, whose fields drift blurs first."""
+"""The default modules, and one of 0.30 m, whose fields are the first that drift blurs."""
 
-_DEFAULT = slice(1, None)  # of these modules
+_DEFAULT = slice(1, None)  # the default modules
 _SHEET = SheetParameters(tau_s=0.02)  # follows 1.3 m/s at 0.30 m, in half the steps of 0.01 s
 _STYLES = ((TRUTH, "--"), (ROBOT, "-"), (CURVES[3], "-"), (MAP, "-"), (LOOP, "-"))
 
@@ -65,18 +65,18 @@ def grid_comparison(
     n_other_seeds: int = 3,
     grid: GridCellConfig = MODULES,
 ) -> dict[str, Any]:
-    """Compare grid cells with OI and CAN under one noise on Hafting's track (Tables 2, 3).
+    """Compare grid cells with OI and CAN with the same noise on Hafting's track (Tables 2, 3).
 
-    Besides with the true motion, and without correction by walls. Figures for each spacing are
-    those of Fig. 11; where boundary cells were active is Fig. 10.
+    The comparison includes the true motion, and SLRB without correction by walls. The figures for
+    each spacing correspond to Fig. 11, that of active boundary cells to Fig. 10.
 
     Args:
         data_folder: Holds the recording, which is run to and fro.
         out_folder: ``results.json`` and the figures are written there.
-        minutes: How long; a census is taken six times. The paper has 30.
-        n_seeds: Animals with our cells.
-        n_other_seeds: Animals with OI and CAN, whose noise is that of the first of ours.
-        grid: Modules of grid cells; the first is left out where spacings are taken together.
+        minutes: Duration, with six censuses; 30 in the paper.
+        n_seeds: Number of animals with SLRB.
+        n_other_seeds: Number of animals with OI and CAN, with the noise of the first with SLRB.
+        grid: Modules of grid cells; the first is left out of averages over spacings.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each method and time (Table 3).
@@ -88,18 +88,21 @@ def grid_comparison(
     encounters = Encounters(walk, [60.0 * minutes * k / 9 for k in range(1, 10)])
     senses = sense(walk, SenseNoise(), others, k=WALLS)
     census: dict[str, list[Census]] = {}
-    census["true motion"], _ = live_grid(walk, [0], times, _config(grid, corrects=False), NO_NOISE)
+    census["true motion"], _ = simulate_grid(
+        walk, [0], times, _config(grid, corrects=False), NO_NOISE
+    )
     census["OI"] = interference_grid(walk, senses, times, grid)
     census["CAN"] = sheet_grid(walk, senses, times, grid)
-    census["SLRB"], errors = live_grid(
+    census["SLRB"], errors = simulate_grid(
         walk, ours, times, _config(grid, corrects=True), watch=encounters
     )
-    census["SLRB, no correction"], drift = live_grid(
+    census["SLRB, no correction"], drift = simulate_grid(
         walk, ours, times, _config(grid, corrects=False)
     )
     for m, spacing in enumerate(grid.spacings_m):
         figure = plot_grids(
-            _grids(walk, census, m), f"Grid cells with fields {spacing:.2f} m apart"
+            _grids(walk, census, m),
+            f"Rate maps and autocorrelograms of grid cells, spacing {spacing:.2f} m",
         )
         save(figure, out / f"grids_{100 * spacing:.0f}cm.png")
     save(
@@ -129,11 +132,11 @@ def grid_comparison(
 
 
 def _config(grid: GridCellConfig, *, corrects: bool) -> BrainConfig:
-    return BrainConfig(grid_cells=grid, wall_memory={"corrects": corrects})
+    return BrainConfig(grid_cells=grid, wall_memory=WallMemoryConfig(corrects=corrects))
 
 
 def sensed_velocity(senses: Senses) -> torch.Tensor:
-    """Speed times measured heading, steps first: ``(steps, seeds, 2)`` in m/s."""
+    """Return the velocity from measured speed and heading, ``(steps, seeds, 2)`` in m/s."""
     heading = np.stack([np.cos(senses.heading_rad), np.sin(senses.heading_rad)], axis=-1)
     return torch.from_numpy((senses.speed_m_s[..., None] * heading).swapaxes(0, 1).copy())
 
@@ -141,7 +144,7 @@ def sensed_velocity(senses: Senses) -> torch.Tensor:
 def interference_grid(
     walk: Walk, senses: Senses, times_s: Sequence[float], grid: GridCellConfig
 ) -> list[Census]:
-    """Let oscillatory interference integrate what was sensed."""
+    """Run oscillatory interference on the sensed motion."""
     velocity, c = sensed_velocity(senses), grid
     shape = (velocity.shape[1], len(c.spacings_m), c.n_cells)
     cells = OscillatoryInterference(
@@ -151,17 +154,17 @@ def interference_grid(
         orientations_rad=np.radians(c.orientations_deg).tolist(),
         batch=shape[0],
     )
-    gatherer = Gatherer(walk, times_s, shape)
+    recorder = CensusRecorder(walk, times_s, shape)
     with torch.inference_mode():
         for step, (v, dt_s) in enumerate(zip(velocity, senses.dt_s.tolist(), strict=True)):
-            gatherer.add(step, cells(v, dt_s).numpy())
-    return gatherer.census
+            recorder.add(step, cells(v, dt_s).numpy())
+    return recorder.census
 
 
 def sheet_grid(
     walk: Walk, senses: Senses, times_s: Sequence[float], grid: GridCellConfig
 ) -> list[Census]:
-    """Let continuous attractors, one for each spacing, integrate what was sensed."""
+    """Run continuous attractors, one for each spacing, on the sensed motion."""
     velocity, modules = sensed_velocity(senses), []
     for spacing, orientation in zip(grid.spacings_m, grid.orientations_deg, strict=True):
         shape = (velocity.shape[1], 1, grid.n_cells)
@@ -172,15 +175,18 @@ def sheet_grid(
             parameters=_SHEET,
             batch=shape[0],
         )
-        gatherer = Gatherer(walk, times_s, shape)
+        recorder = CensusRecorder(walk, times_s, shape)
         with torch.inference_mode():
             for step, (v, dt_s) in enumerate(zip(velocity, senses.dt_s.tolist(), strict=True)):
-                gatherer.add(step, cells(v, dt_s).numpy())
-        modules.append(gatherer.census)
+                recorder.add(step, cells(v, dt_s).numpy())
+        modules.append(recorder.census)
     return [
         Census(
             now[0].time_s,
-            *(np.concatenate(parts, axis=1) for parts in list(zip(*now, strict=True))[1:-1]),
+            np.concatenate([one.silent for one in now], axis=1),
+            np.concatenate([one.skip for one in now], axis=1),
+            np.concatenate([one.last for one in now], axis=1),
+            np.concatenate([one.n_fields for one in now], axis=1),
             np.concatenate([one.maps for one in now]),
         )
         for now in zip(*modules, strict=True)
@@ -188,7 +194,7 @@ def sheet_grid(
 
 
 class Encounters:
-    """Watches, for Table 2 and Fig. 10, where boundary cells are active, and how many were."""
+    """Recorder of active boundary cells, for Table 2 and Fig. 10."""
 
     def __init__(self, walk: Walk, times_s: Sequence[float]) -> None:
         self.walk, self.times_s = walk, list(times_s)
@@ -198,13 +204,13 @@ class Encounters:
         self.counts: list[np.ndarray] = []
 
     def __call__(self, step: int, cells: NavigationCells) -> None:
-        """Look at the cells after a step."""
+        """Record the cells after a step."""
         self.activity[step] = cells.boundary.activity[0].item()
         while len(self.counts) < len(self.stops) and step == self.stops[len(self.counts)]:
             self.counts.append(cells.familiarity.n_activated().numpy().copy())
 
     def rows(self, errors_m: np.ndarray, drift_m: np.ndarray) -> list[dict[str, Any]]:
-        """Lay out Table 2, from the errors with and without correction, ``(seeds, steps)``."""
+        """Return Table 2, from the errors with and without correction, ``(seeds, steps)``."""
         fits = math.isclose(self.times_s[-1], 1800.0)
         paper = zip(*PAPER_TABLE_2.values(), strict=True) if fits else [(math.nan, math.nan)] * 9
         return [
@@ -224,13 +230,14 @@ class Encounters:
         ]
 
     def plot(self) -> Figure:
-        """Draw where they were active."""
+        """Draw the positions where boundary cells were active."""
         stops = {
             f"{time_s:.0f} s|{counts[0]} activated": int(stop)
             for time_s, counts, stop in zip(self.times_s, self.counts, self.stops, strict=True)
         }
-        title = "Where boundary cells were active, until each time"
-        return plot_encounters(self.walk.positions, self.activity, stops, self.walk.arena, title)
+        title = "Activity of boundary cells along the path, up to each time"
+        arena = arena_of(self.walk)
+        return plot_encounters(self.walk.positions, self.activity, stops, arena, title)
 
 
 def _table_3(census: dict[str, list[Census]]) -> list[dict[str, Any]]:
@@ -277,8 +284,8 @@ def _by_spacing(census: dict[str, list[Census]], grid: GridCellConfig) -> list[d
 
 def _curves(census: dict[str, list[Census]], grid: GridCellConfig) -> dict[str, dict[str, Curve]]:
     panels: dict[str, dict[str, Curve]] = {}
-    together = f"{grid.spacings_m[1]:.2f} to {grid.spacings_m[-1]:.2f} m apart, together"
-    names = [together, *(f"{spacing:.2f} m apart" for spacing in grid.spacings_m)]
+    together = f"spacings {grid.spacings_m[1]:.2f} to {grid.spacings_m[-1]:.2f} m together"
+    names = [together, *(f"spacing {spacing:.2f} m" for spacing in grid.spacings_m)]
     for name, part in zip(names, (_DEFAULT, *range(len(grid.spacings_m))), strict=True):
         panels[name] = {}
         for (method, taken), (colour, dash) in zip(census.items(), _STYLES, strict=True):
@@ -293,7 +300,7 @@ def _curves(census: dict[str, list[Census]], grid: GridCellConfig) -> dict[str, 
 
 
 def _grids(walk: Walk, census: dict[str, list[Census]], module: int) -> dict[str, list[Firing]]:
-    """The cell of each method whose score is in the middle at the end, at three times."""
+    """Return the cell of each method with the median score at the end, at three times."""
     rows = {}
     for method, taken in census.items():
         cell = median_cell(taken[-1], module)

@@ -1,7 +1,7 @@
-"""Head-direction and speed cells beside what was recorded in rats, and beside theory.
+"""Head-direction and speed cells compared with recordings of rats, and with theory.
 
-Tuning, persistence, gain, drift with a noisy sense of turning with and without cues, near and far
-cues, and the linear code of speed.
+Tuning, persistence, gain, drift with a noisy turn rate with and without cues, near and far cues,
+and the linear code of speed.
 """
 
 import math
@@ -40,10 +40,10 @@ GYRO_DEG_S = 10.0
 COMPASS_DEG = 10.0
 """White noise of the compass, at every sample."""
 VIEW_DEG = 10.0
-"""A view is recognised within this range of headings."""
+"""Range of headings in which a view is matched."""
 
 _WITH_VIEWS = 8
-_TURNS_DEG_S, _TURNS_S = 80.0, 0.5  # how an animal turns: sd, and for how long one way
+_TURNS_DEG_S, _TURNS_S = 80.0, 0.5  # turn rates of an animal: sd, and correlation time
 
 
 def head_direction(
@@ -52,12 +52,12 @@ def head_direction(
     """Measure head-direction cells and speed cells.
 
     Args:
-        data_folder: Not needed.
+        data_folder: Not used.
         out_folder: ``results.json`` and ``tuning.png``, ``turning.png``, ``cues.png``,
             ``drift.png``, ``persistence.png``, ``speed_cells.png`` are written there.
-        minutes: How long bumps persist and drift.
-        n_animals: Animals that drift, which differ in how they turn and in their noise; with
-            views the first eight of them.
+        minutes: Duration of the tests of persistence and drift.
+        n_animals: Number of animals in the test of drift, which differ in turns and noise; the
+            first eight of them with views.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each quantity.
@@ -86,12 +86,12 @@ def head_direction(
 
 
 def row(quantity: str, value: float, expected: str) -> dict[str, Any]:
-    """Say what a quantity is, and what it should be, by whom."""
+    """Return a row: a quantity, its value, and the expected value with its source."""
     return {"quantity": quantity, "value": float(value), "expected": expected}
 
 
 def tuning(out: Path) -> list[dict[str, Any]]:
-    """Turn an ideal animal once round, and draw the tuning of some cells."""
+    """Measure tuning curves over a full turn, and draw those of some cells."""
     cells = HeadDirectionCells()
     at = np.arange(1440) * math.pi / 720.0
     rates = (bump_at(cells.ring, torch.from_numpy(at)) / cells.ring.peak).numpy()
@@ -107,7 +107,7 @@ def tuning(out: Path) -> list[dict[str, Any]]:
 
 
 def turns(seconds: float, animals: int, seed: int) -> np.ndarray:
-    """Draw turn rates that change as an animal's do (rad/s), ``(t, animals)``."""
+    """Return random turn rates with the statistics of an animal (rad/s), ``(t, animals)``."""
     rng = np.random.default_rng(seed)
     kept = math.exp(-DT_S / _TURNS_S)
     rates = np.zeros((round(seconds / DT_S), animals))
@@ -119,21 +119,26 @@ def turns(seconds: float, animals: int, seed: int) -> np.ndarray:
 
 
 def turning(out: Path) -> list[dict[str, Any]]:
-    """Follow an animal that turns as it likes, and one that spins at 500 degrees a second."""
+    """Follow an animal that turns freely, and one that spins at 500 degrees per second."""
     bumps, worst = [], 0.0
     free = turns(20.0, 1, seed=4)[:, 0]
     spin = np.where(np.arange(120) < 80, math.radians(500.0), -math.radians(500.0))
     for title, rates in (("Turning freely", free), ("Spinning at 500 °/s", spin)):
-        cells, activity, told = HeadDirectionCells(), [], []
+        cells, activity, decoded = HeadDirectionCells(), [], []
         for rate in rates:
-            told.append(cells(Motion(0.0, rate, DT_S)))
+            decoded.append(cells(Motion(0.0, rate, DT_S)))
             activity.append(cells.rates)
         true = np.cumsum(rates) * DT_S
-        worst = max(worst, np.abs(wrap_angles(np.array(told) - true)).max())
+        worst = max(worst, np.abs(wrap_angles(np.array(decoded) - true)).max())
         time = (1 + np.arange(len(rates))) * DT_S
         bumps.append(
             Bump(
-                title, time, np.array(activity), np.degrees(told), np.degrees(true), "true heading"
+                title,
+                time,
+                np.array(activity),
+                np.degrees(decoded),
+                np.degrees(true),
+                "true heading",
             )
         )
     save(plot_bumps(bumps, "The bump follows the integral of the turn rate"), out / "turning.png")
@@ -141,26 +146,26 @@ def turning(out: Path) -> list[dict[str, Any]]:
 
 
 def cues(out: Path) -> list[dict[str, Any]]:
-    """Show a cue 40 degrees from the bump, and one 140 degrees from it, for long and for short."""
+    """Show a cue 40 degrees from the bump, and one at 140 degrees for 5 s and for 0.15 s."""
     bumps, rows = [], []
     for away, seconds in ((40.0, 5.0), (140.0, 5.0), (140.0, 0.15)):
-        cells, activity, told = HeadDirectionCells(), [], []
+        cells, activity, decoded = HeadDirectionCells(), [], []
         time = (1 + np.arange(120)) * DT_S
         shown = (time > 1.0) & (time <= 1.0 + seconds)
         for there in shown:
             cells.advance(Motion(0.0, 0.0, DT_S))
             if there:
                 cells.correct(math.radians(away), cells.config.view_s, DT_S)
-            told.append(math.degrees(cells.heading_rad))
+            decoded.append(math.degrees(cells.heading_rad))
             activity.append(cells.rates)
         what = f"Cue {away:g}° away, for {seconds:g} s"
         cue = np.where(shown, away, np.nan)
-        bumps.append(Bump(what, time, np.array(activity), np.array(told), cue, "cue"))
-        between = [0.15 * away < heading < 0.85 * away for heading in told]
+        bumps.append(Bump(what, time, np.array(activity), np.array(decoded), cue, "cue"))
+        between = [0.15 * away < heading < 0.85 * away for heading in decoded]
         name = f"{away:g}_deg_for_{seconds:g}_s"
         rows.append(row(f"cue_{name}_time_between_s", sum(between) * DT_S, _CUES[away]))
-        rows.append(row(f"cue_{name}_ends_at_deg", told[-1], f"{away if seconds > 1 else 0:g}"))
-    save(plot_bumps(bumps, "A near cue pulls the bump, a far one makes it jump"), out / "cues.png")
+        rows.append(row(f"cue_{name}_ends_at_deg", decoded[-1], f"{away if seconds > 1 else 0:g}"))
+    save(plot_bumps(bumps, "A near cue moves the bump, a far cue makes it jump"), out / "cues.png")
     return rows
 
 
@@ -171,7 +176,7 @@ _CUES = {
 
 
 def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
-    """Let animals turn with a noisy sense of turning: alone, with a compass, with views."""
+    """Measure drift with a noisy turn rate: without cues, with a compass, with views."""
     rates = turns(60.0 * minutes, animals, seed=1)
     rng = np.random.default_rng(2)
     gyro = math.radians(GYRO_DEG_S) * rng.normal(size=rates.shape)
@@ -186,9 +191,9 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
         errors["alone"].append(alone.heading_rad.numpy() - heading)
         errors["led"].append(led.heading_rad.numpy() - heading)
     few = slice(None, _WITH_VIEWS)
-    lives = zip((rates + gyro).T[few], true.T[few], strict=True)
-    seen = np.stack([see(*one) for one in lives], axis=1)
-    # Unwrapped: a random walk may have gone farther than half a turn.
+    animals_with_views = zip((rates + gyro).T[few], true.T[few], strict=True)
+    with_views = np.stack([errors_with_views(*one) for one in animals_with_views], axis=1)
+    # Unwrapped: a random walk may exceed half a turn.
     walked = np.degrees(np.unwrap(errors["alone"], axis=0))
     held = np.degrees(wrap_angles(np.array(errors["led"])))
     time = (1 + np.arange(len(rates))) * DT_S
@@ -196,7 +201,7 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
     steady = filtered_sd(GYRO_DEG_S * DT_S, COMPASS_DEG, HeadDirectionConfig().compass_s)
     every = slice(None, None, 60)
     panels = [
-        Drift("No cue", time[every], walked[every], walk[every], r"$\pm\sigma\sqrt{T\,dt}$"),
+        Drift("Without cues", time[every], walked[every], walk[every], r"$\pm\sigma\sqrt{T\,dt}$"),
         Drift(
             f"Compass, {COMPASS_DEG:g}° of noise",
             time[every],
@@ -204,9 +209,9 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
             np.full_like(time[every], steady),
             "± sd of the filter",
         ),
-        Drift(f"Views, {VIEW_DEG:g}° wide each", time[every], seen[every]),
+        Drift(f"Views, {VIEW_DEG:g}° wide each", time[every], with_views[every]),
     ]
-    title = f"Drift with {GYRO_DEG_S:g} °/s of noise in every turn rate"
+    title = f"Drift of the heading with {GYRO_DEG_S:g} °/s of noise in every turn rate"
     save(plot_drifts(panels, title), out / "drift.png")
     settled = slice(len(time) // 4, None)
     return [
@@ -217,32 +222,33 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
             "0: the walk is that of the noise",
         ),
         row("error_with_compass_rms_deg", _rms(held[settled]), f"{steady:.2f}: filter"),
-        row("error_with_views_rms_deg", _rms(seen[settled]), f"within a view, {VIEW_DEG:g}"),
-        row("error_with_views_largest_deg", np.abs(seen[settled]).max(), "bounded"),
+        row("error_with_views_rms_deg", _rms(with_views[settled]), f"within a view, {VIEW_DEG:g}"),
+        row("error_with_views_largest_deg", np.abs(with_views[settled]).max(), "bounded"),
     ]
 
 
 def filtered_sd(walk_deg: float, heard_deg: float, compass_s: float) -> float:
-    r"""Return the error that a compass leaves of a random walk.
+    r"""Return the standard deviation of a random walk that a compass corrects.
 
     .. math:: \sigma^2 = \frac{(1-g)^2 q^2 + g^2 r^2}{1 - (1-g)^2}, \qquad g = 1 - e^{-dt/\tau}
 
-    with :math:`q` the walk of a step and :math:`r` the noise of the compass.
+    with :math:`q` the noise of a step and :math:`r` the noise of the compass.
     """
     g = -math.expm1(-DT_S / compass_s)
     kept = (1.0 - g) ** 2
     return math.sqrt((kept * walk_deg**2 + g**2 * heard_deg**2) / (1.0 - kept))
 
 
-def see(sensed: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Let one animal see a view for every range of headings; errors in degrees, ``(t,)``."""
-    cells, ids, errors = HeadDirectionCells(), {}, []
+def errors_with_views(sensed: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Run one animal with a view for every range of headings; errors in degrees, ``(t,)``."""
+    cells, errors = HeadDirectionCells(), []
+    ids: dict[int, int] = {}
     for rate, heading in zip(sensed, true, strict=True):
-        looks = math.floor(math.degrees(heading) % 360.0 / VIEW_DEG)
-        new = looks not in ids
-        template = ids.setdefault(looks, len(ids))
-        told = cells(Motion(0.0, rate, DT_S), ViewMatch(template, 0.0, 0.0, new))
-        errors.append(math.degrees(wrap_angle(told - heading)))
+        view = math.floor(math.degrees(heading) % 360.0 / VIEW_DEG)
+        new = view not in ids
+        template = ids.setdefault(view, len(ids))
+        decoded = cells(Motion(0.0, rate, DT_S), ViewMatch(template, 0.0, 0.0, new))
+        errors.append(math.degrees(wrap_angle(decoded - heading)))
     return np.array(errors)
 
 
@@ -251,7 +257,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def persistence(out: Path, minutes: float) -> list[dict[str, Any]]:
-    """Leave bumps to themselves, on cells and between them, and one that begins as noise."""
+    """Run bumps without input, on cells and between them, and one that starts from noise."""
     shares = np.linspace(0.0, 1.0, 5)
     start = shares * 2.0 * math.pi / HeadDirectionConfig().n + 0.7
     cells = HeadDirectionCells(batch=len(start) + 1)
@@ -265,8 +271,8 @@ def persistence(out: Path, minutes: float) -> list[dict[str, Any]]:
         if k % 100 == 0:
             headings.append(cells.heading_rad.numpy())
             widths.append([tuning_width(rates) for rates in cells.rates[[1, -1]]])
-    told = np.array(headings)[:, :-1]
-    moved = np.degrees(wrap_angles(told - told[0]))
+    decoded = np.array(headings)[:, :-1]
+    moved = np.degrees(wrap_angles(decoded - decoded[0]))
     width = np.array(widths)
     time = np.arange(len(moved)) * 100 * DT_S
     save(plot_persistence(time, moved, width[:, 0]), out / "persistence.png")
@@ -278,16 +284,16 @@ def persistence(out: Path, minutes: float) -> list[dict[str, Any]]:
 
 
 def running(out: Path, minutes: float) -> list[dict[str, Any]]:
-    """Let an animal run at changing speeds, with noise and without, and correlate."""
+    """Run speed cells at changing speeds, with noise and without, and correlate."""
     n = round(60.0 * minutes / DT_S)
     rough = gaussian_filter1d(np.random.default_rng(5).normal(size=n), 0.4 / DT_S)
     speeds = (0.3 + 0.15 * rough / rough.std()).clip(0.0)
-    scores, told, rates = {}, {}, {}
+    scores, decoded, rates = {}, {}, {}
     for noise_hz in (0.0, 4.0):
         cells = SpeedCells(SpeedCellConfig(max_speed_m_s=1.0, noise_hz=noise_hz))
-        lives = [(cells(Motion(speed, 0.0, DT_S)), cells.rates) for speed in speeds]
-        told[noise_hz] = np.array([one for one, _ in lives])
-        rates[noise_hz] = np.array([one for _, one in lives])
+        steps = [(cells(Motion(speed, 0.0, DT_S)), cells.rates) for speed in speeds]
+        decoded[noise_hz] = np.array([speed for speed, _ in steps])
+        rates[noise_hz] = np.array([rate for _, rate in steps])
         scores[noise_hz] = speed_score(rates[noise_hz], speeds)
     ideal = SpeedCells(SpeedCellConfig(max_speed_m_s=1.0, lead_s=(0.0, 0.0)))
     steady = np.linspace(0.0, 1.25, 26)
@@ -301,7 +307,7 @@ def running(out: Path, minutes: float) -> list[dict[str, Any]]:
         np.array(at_steady),
         speeds[shown],
         rates[4.0][shown, 0],
-        told[4.0][shown],
+        decoded[4.0][shown],
         scores[4.0],
     )
     save(figure, out / "speed_cells.png")
@@ -309,12 +315,14 @@ def running(out: Path, minutes: float) -> list[dict[str, Any]]:
     time = np.arange(n) * DT_S
     inner = slice(20, -20)
     fits = [
-        np.corrcoef(told[0.0][inner], np.interp(time[inner] + lag, time, speeds))[0, 1]
+        np.corrcoef(decoded[0.0][inner], np.interp(time[inner] + lag, time, speeds))[0, 1]
         for lag in lags
     ]
     return [
         row("speed_ahead_s", lags[int(np.argmax(fits))], "0.05 to 0.08 (Kropff et al. 2015)"),
         row("speed_score_without_noise", scores[0.0].mean(), "near 1: linear"),
         row("speed_score_with_4_hz_of_noise", scores[4.0].mean(), ""),
-        row("speed_told_error_without_noise_m_s", _rms(told[0.0] - speeds), "lead x acceleration"),
+        row(
+            "speed_told_error_without_noise_m_s", _rms(decoded[0.0] - speeds), "lead x acceleration"
+        ),
     ]

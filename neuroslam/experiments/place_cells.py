@@ -1,20 +1,22 @@
-"""Maps of places by SLRB, against competitive Hebbian learning, RatSLAM and path integration.
+"""Maps of place cells by SLRB, competitive Hebbian learning, RatSLAM and path integration.
 
 Paper: SLRB, Figs. 7, 8, 9, 12 and 13; it gives 0.031 m on the Hafting track after half an hour,
-47.2 % less than competitive Hebb and 56.9 % less than RatSLAM. What is told beside it:
+47.2 % less than competitive Hebb and 56.9 % less than RatSLAM. Differences and conditions:
 
-- Competitive Hebb is the same network without the correction by walls; its integrator is plain path
-  integration, so what it adds is the error of its winning cell.
-- RatSLAM is its pose cells alone, as in the paper: no view corrects them.
-- That several place cells respond until walls correct (Fig. 8) does not reproduce: drift moves the
-  phases of all modules alike, so the grid's pattern stays sharp, and is of the wrong place.
-- That cells are fewer by half does not reproduce: competitive Hebb has 15 to 30 % more. RatSLAM
-  has 70 to 90 % more, for another reason: its cells are a lattice, which needs more for a plane
-  than places that keep a distance.
-- An error of the winner is that of the winning cell's centre. Cells 0.06 m apart have a floor.
-- By default the bearing of a wall is measured from the true heading and so has the noise of the
-  compass in it once that is added. The reference figures were made with bearings measured from the
-  noisy compass, where that noise cancels: an easier sense, told as a condition of its own.
+- Competitive Hebb is the same network without correction by walls; its integrator is plain path
+  integration, to which it adds the error of its winning cell.
+- RatSLAM is its pose cells alone, without correction by views, as in the paper.
+- The several place cells that respond until walls correct (Fig. 8) are not reproduced: drift moves
+  the phases of all modules together, so the pattern of the grid cells stays sharp, but is that of
+  a wrong position.
+- The reduction of the number of cells by half is not reproduced: competitive Hebb has 15 to 30 %
+  more cells. RatSLAM has 70 to 90 % more for another reason: its cells are a lattice, which needs
+  more cells for a plane than place cells with a least distance.
+- The error of the winner is that of the winning cell's centre, which is above 0 for cells 0.06 m
+  apart.
+- By default the bearing of a wall is relative to the true heading, and gets the noise of the
+  compass when the compass is added. The reference figures used bearings relative to the noisy
+  compass, in which that noise cancels: an easier sense, which is a condition of its own here.
 """
 
 import json
@@ -26,19 +28,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuroslam.config import BrainConfig
+from neuroslam.config import BrainConfig, PlaceCellConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
-from neuroslam.experiments.animals import TRACKS, WALLS, live_with, position_errors, read_track
-from neuroslam.experiments.place_lives import (
+from neuroslam.experiments.animals import (
+    TRACKS,
+    WALLS,
+    arena_of,
+    position_errors,
+    read_track,
+    run_cells,
+)
+from neuroslam.experiments.place_methods import (
     EASY,
     FULL,
     HEBB,
     PATH,
     RATSLAM,
     SLRB,
-    Diary,
-    Told,
+    MethodResult,
+    PlaceCellLog,
     TrackResult,
     run_track,
 )
@@ -61,7 +70,7 @@ PAPER = {
     "mean_error_m_below_hebb_percent": 47.2,
     "mean_error_m_below_ratslam_percent": 56.9,
 }
-"""What the paper gives, for the Hafting track."""
+"""The paper's values, for the Hafting track."""
 
 RATIO_TARGETS = dict.fromkeys(TRACKS, 0.25) | {"hafting": 0.40, "sargolini": 0.55}
 ERROR_TARGETS_M = dict.fromkeys(TRACKS, 0.035) | {"hafting": 0.05, "sargolini": None}
@@ -70,15 +79,15 @@ BELOW_HEBB_TARGET_PERCENT, BELOW_RATSLAM_TARGET_PERCENT = 47.0, 57.0
 GROWTH_TARGET_PERCENT, SINGLE_TARGET = 5.0, 0.95
 _COMPARED = "mean_error_m", "last_sixth_mean_error_m", "winner_mean_error_m"
 _CURVE_POINTS = 30
-_PATH_SHARE = 0.1  # of the time, at the end, whose path is drawn: more of it hides itself
+_PATH_SHARE = 0.1  # share of the time, at the end, of the paths drawn: longer ones overlap
 
 
-def summarise(told: Sequence[Told]) -> list[dict[str, Any]]:
-    """Measure what was told: a row for each track, condition and method, means and sds of seeds."""
+def summarise(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
+    """Return means and sds over seeds: a row for each track, condition and method."""
     rows = []
-    for one in told:
+    for one in results:
         errors = position_errors(one.estimate_m, one.truth_m)
-        free = _alike(told, one, PATH)
+        free = _counterpart(results, one, PATH)
         drifted = position_errors(free.estimate_m, free.truth_m)
         last = one.minutes >= one.minutes[-1] * 5 / 6
         distance = np.linalg.norm(one.estimate_m - one.truth_m, axis=-1)
@@ -97,7 +106,7 @@ def summarise(told: Sequence[Told]) -> list[dict[str, Any]]:
         if one.cells is not None:
             values["cells"] = one.cells.values[:, -1]
             values["cells_growth_last_third_percent"] = growth_percent(one.cells)
-        row = {"track": one.track, "condition": one.condition, "method": one.method}
+        row: dict[str, Any] = {"track": one.track, "condition": one.condition, "method": one.method}
         for key, value in values.items():
             row |= {key: float(np.mean(value)), f"{key}_sd": float(np.std(value))}
         rows.append(row | dict(one.more))
@@ -113,40 +122,42 @@ def summarise(told: Sequence[Told]) -> list[dict[str, Any]]:
 
 
 def growth_percent(cells: Spread) -> np.ndarray:
-    """Return by how much numbers grew in the last third of the time, ``(seeds,)``.
+    """Return the growth of the number of cells in the last third of the time, ``(seeds,)``.
 
     Example:
         >>> growth_percent(Spread(np.array([0.0, 20.0, 30.0]), np.array([[1, 100, 104]])))
         array([4.])
     """
     then = int(np.searchsorted(cells.minutes, cells.minutes[-1] * 2 / 3 - 1e-9))
-    return 100.0 * (cells.values[:, -1] / cells.values[:, then] - 1.0)
+    return np.asarray(100.0 * (cells.values[:, -1] / cells.values[:, then] - 1.0))
 
 
 def _motion(condition: str) -> str:
-    """Return the condition with the same noise of motion, which all methods were told."""
+    """Return the condition with the same noise of motion, which all methods have run."""
     return FULL if condition == EASY else condition
 
 
-def _alike(told: Sequence[Told], one: Told, method: str) -> Told:
+def _counterpart(results: Sequence[MethodResult], one: MethodResult, method: str) -> MethodResult:
     wanted = one.track, _motion(one.condition), method
-    return next(o for o in told if (o.track, o.condition, o.method) == wanted)
+    return next(o for o in results if (o.track, o.condition, o.method) == wanted)
 
 
-def _row_of(rows: Sequence[Mapping[str, Any]], row: Mapping[str, Any], method: str) -> Mapping:
+def _row_of(
+    rows: Sequence[Mapping[str, Any]], row: Mapping[str, Any], method: str
+) -> Mapping[str, Any]:
     wanted = row["track"], _motion(row["condition"]), method
     return next(r for r in rows if (r["track"], r["condition"], r["method"]) == wanted)
 
 
 def check_targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare what walls gave at full noise with what was aimed at, and with the paper's.
+    """Compare SLRB at full noise with the targets and with the paper.
 
     Args:
-        rows: As :func:`summarise` makes them.
+        rows: Rows of :func:`summarise`.
 
     Returns:
-        Rows of ``track``, ``what``, ``ours``, ``target``, whether it is ``met``, and the
-        ``paper``'s figure where it has one: for the Hafting track.
+        Rows of ``track``, ``what``, ``ours``, ``target``, whether it is ``met``, and the value of
+        the ``paper`` where it has one: for the Hafting track.
     """
     growth = "cells_growth_last_third_percent"
     checks = []
@@ -190,26 +201,27 @@ def place_map(
     jobs: int | None = None,
     ray: str | None = None,
 ) -> dict[str, Any]:
-    """Map places of five tracks with and without walls, and with pose cells (Figs. 8, 9, 12, 13).
+    """Map five tracks with and without walls, and with pose cells (Figs. 8, 9, 12, 13).
 
     Args:
         data_folder: Holds the recordings of ``TRACKS``.
         out_folder: ``results.json`` and the figures are written there.
-        tracks: Which of them.
-        minutes: How long; Sargolini's rat at most its 20 min.
-        seeds: Of the noise; one life each.
-        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: tracks side by side.
-        ray: The same; the folders are on a disk that all machines share.
+        tracks: Names in ``TRACKS``.
+        minutes: Duration; at most 20 min of Sargolini's rat.
+        seeds: Seed of the noise of each animal.
+        jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: tracks in parallel.
+        ray: As for :func:`neuroslam.runs.parallel.parallel_map`; the folders must be on a disk that
+            all machines share.
 
     Returns:
         The content of ``results.json``: ``rows`` in short, ``details`` with standard deviations
-        over seeds and the responses, ``checks`` of what was aimed at, the ``paper``'s figures.
+        over seeds and the responses, ``checks`` of the targets, and values of the ``paper``.
     """
     out = Path(out_folder).resolve()
-    tell = partial(_told, Path(data_folder).resolve(), out, minutes, seeds)
-    told = [one for each in parallel_map(tell, tracks, jobs, ray) for one in each]
-    details = summarise(told)
-    _draw_errors(told, out)
+    run = partial(_run_and_draw, Path(data_folder).resolve(), out, minutes, seeds)
+    results = [one for each in parallel_map(run, tracks, jobs, ray) for one in each]
+    details = summarise(results)
+    _draw_errors(results, out)
     return _write(
         out,
         {
@@ -224,10 +236,12 @@ def place_map(
     )
 
 
-def _told(data: Path, out: Path, minutes: float, seeds: Sequence[int], name: str) -> list[Told]:
+def _run_and_draw(
+    data: Path, out: Path, minutes: float, seeds: Sequence[int], name: str
+) -> list[MethodResult]:
     result = run_track(data, name, minutes, seeds)
     draw_track(result, out)
-    return result.told
+    return result.results
 
 
 def _write(out: Path, results: dict[str, Any]) -> dict[str, Any]:
@@ -236,28 +250,28 @@ def _write(out: Path, results: dict[str, Any]) -> dict[str, Any]:
     return results
 
 
-def _draw_errors(told: Sequence[Told], out: Path) -> None:
+def _draw_errors(results: Sequence[MethodResult], out: Path) -> None:
     errors: dict[str, dict[str, np.ndarray]] = {}
-    for one in told:
+    for one in results:
         if one.condition == FULL and one.method != PATH:
             mean = position_errors(one.estimate_m, one.truth_m).mean_m
             errors.setdefault(one.method, {})[one.track] = mean
     marks = {"paper's SLRB, Hafting": PAPER["mean_error_m"]}
     save(
-        plot_errors(errors, marks, "Walls correct the drift of path integration"),
+        plot_errors(errors, marks, "Position error by method; SLRB corrects drift by walls"),
         out / "errors.png",
     )
 
 
 def draw_track(result: TrackResult, out: Path) -> None:
     """Write the figures of a track: maps, paths, responses, curves."""
-    name, walk, arena = result.name, result.walk, result.walk.arena
-    full = {one.method: one for one in result.told if one.condition == FULL}
+    name, walk, arena = result.name, result.walk, arena_of(result.walk)
+    full = {one.method: one for one in result.results if one.condition == FULL}
     slrb, hebb, pose = (full[method] for method in (SLRB, HEBB, RATSLAM))
     times = (f"{result.early_min:.3g} min", f"{slrb.minutes[-1]:.3g} min")
     sources = (
-        (SLRB, result.diaries[SLRB].maps),
-        (HEBB, result.diaries[HEBB].maps),
+        (SLRB, result.logs[SLRB].maps),
+        (HEBB, result.logs[HEBB].maps),
         (f"{RATSLAM} pose cells", result.pose_maps),
     )
     maps = [
@@ -265,7 +279,7 @@ def draw_track(result: TrackResult, out: Path) -> None:
         for i, when in enumerate(times)
     ]
     truth = walk.positions
-    title = f"Places on the {name} track, first seed"
+    title = f"Maps of cells on the {name} track, first seed"
     save(plot_place_maps(maps, arena, truth, title), out / f"{name}_maps.png")
     walls = result.walls
     feet = torch.stack(
@@ -281,24 +295,24 @@ def draw_track(result: TrackResult, out: Path) -> None:
         EstimatedPath(PATH, full[PATH].estimate_m[0, last]),
     ]
     span = f"{slrb.minutes[last][0]:.3g} to {times[1]}"
-    title = f"Believed and true path on the {name} track, {span}, first seed"
+    title = f"Estimated and true path on the {name} track, {span}, first seed"
     save(plot_paths(paths, arena, truth[last], title), out / f"{name}_paths.png")
     if picture := _responses(result):
         at = (walk.times_s[picture[0]] - walk.times_s[0]) / 60.0
         title = (
-            f"Responses beside a wall, {name} track, {at:.1f} min: when most cells responded before"
+            f"Place cells beside a wall, {name} track, {at:.1f} min: most cells without correction"
         )
         save(plot_responses(picture[1], arena, title), out / f"{name}_responses.png")
-    cells = {SLRB: slrb.cells, HEBB: hebb.cells, RATSLAM: pose.cells}
+    cells = {one.method: one.cells for one in (slrb, hebb, pose) if one.cells is not None}
     errors = {SLRB: _curve(slrb), HEBB: _curve(hebb), RATSLAM: _curve(pose)}
     marks = {"paper's SLRB at the end": PAPER["mean_error_m"]} if name == "hafting" else {}
-    title = f"Places and errors on the {name} track; no walls for {HEBB} and {RATSLAM}"
+    title = f"Place cells and errors on the {name} track; no walls for {HEBB} and {RATSLAM}"
     save(plot_growth(cells, errors, marks, title), out / f"{name}_growth.png")
 
 
 def _responses(result: TrackResult) -> tuple[int, list[Response]] | None:
-    """Show the last instant when the uncorrected network responds with most cells by the grid."""
-    before, after = result.diaries[HEBB].looks, result.diaries[SLRB].looks
+    """Return the last step with the largest number of responding cells without correction."""
+    before, after = result.logs[HEBB].looks, result.logs[SLRB].looks
     common = sorted(before.keys() & after.keys())
     if not common:
         return None
@@ -306,13 +320,13 @@ def _responses(result: TrackResult) -> tuple[int, list[Response]] | None:
     step = common[len(most) - 1 - int(np.argmax(most[::-1]))]
     here = result.walk.positions[step]
     return step, [
-        Response("Before: uncorrected, grid alone", before[step][0], before[step][2], here),
-        Response("After: walls correct", after[step][0], after[step][1], here),
+        Response("Without correction, grid only", before[step][0], before[step][2], here),
+        Response("With correction by walls", after[step][0], after[step][1], here),
     ]
 
 
-def _curve(one: Told) -> Spread:
-    """Average the error within each of 30 windows."""
+def _curve(one: MethodResult) -> Spread:
+    """Return the mean error in each of 30 windows of time."""
     distance = np.linalg.norm(one.estimate_m - one.truth_m, axis=-1)
     parts = np.array_split(np.arange(len(one.minutes)), _CURVE_POINTS)
     return Spread(
@@ -331,34 +345,35 @@ def threshold_sweep(
 ) -> dict[str, Any]:
     """Vary the least distance between place cells (Fig. 7).
 
-    The paper has the least error at 0.06 m. Here the winner's error rises with the distance: it is
-    how coarsely cells tell a position, and the integrated position does not depend on it.
+    The paper has the least error at 0.06 m. Here the error of the winner rises with the distance,
+    which is the resolution of the cells, and the integrated position does not depend on it.
 
     Args:
         data_folder: Holds the recordings of ``TRACKS``.
         out_folder: ``results.json`` and ``thresholds.png`` are written there.
         thresholds_m: Distances, rising.
-        track: Which of them.
-        minutes: How long.
-        seeds: Of the noise; one life each.
+        track: Name in ``TRACKS``.
+        minutes: Duration.
+        seeds: Seed of the noise of each animal.
 
     Returns:
-        The content of ``results.json``: ``rows``, and where the paper and we have the least error.
+        The content of ``results.json``: ``rows``, and the distances of the least error here and in
+        the paper.
     """
     walk = read_track(Path(data_folder), track, minutes)
     senses = sense(walk, SenseNoise(), seeds, k=WALLS)
     rows, winners, integrators, counts = [], [], [], []
     for threshold in thresholds_m:
-        diary = Diary(np.zeros(senses.speed_m_s.shape, dtype=bool), walk.positions[0], 0)
-        live_with(senses, BrainConfig(place_cells={"threshold_m": threshold}), diary)
+        log = PlaceCellLog(np.zeros(senses.speed_m_s.shape, dtype=bool), walk.positions[0], 0)
+        run_cells(senses, BrainConfig(place_cells=PlaceCellConfig(threshold_m=threshold)), log)
         start = walk.positions[0]
         apart = [
             np.linalg.norm(x + start - walk.positions[:, None], axis=-1)
-            for x in (diary.winner, diary.estimate)
+            for x in (log.winner, log.estimate)
         ]
         winners.append(apart[0].ravel())
         integrators.append(apart[1].ravel())
-        counts.append(diary.counted[-1])
+        counts.append(log.counted[-1])
         row = {"threshold_m": threshold}
         for name, error in zip(("winner", "integrator"), apart, strict=True):
             mean = error.mean(axis=0)
@@ -368,7 +383,7 @@ def threshold_sweep(
                 f"{name}_median_error_m": float(np.median(error)),
             }
         rows.append(row | {"cells": float(counts[-1].mean()), "cells_sd": float(counts[-1].std())})
-    title = f"Distance between place cells, {track} track: the winner's error is its coarseness"
+    title = f"Error over the least distance between place cells, {track} track"
     out = Path(out_folder)
     save(plot_sweep(thresholds_m, winners, integrators, counts, title), out / "thresholds.png")
     least = min(rows, key=lambda row: row["winner_mean_error_m"])

@@ -9,7 +9,7 @@ import numpy as np
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.compare import live
+from neuroslam.experiments.compare import run_brain
 from neuroslam.figures.comparison import plot_without
 from neuroslam.figures.style import save
 from neuroslam.runs.parallel import parallel_map
@@ -128,7 +128,7 @@ def error_of(without: Without, frames: Sequence[Frame]) -> float:
     config = build_config(merge_values(read_preset("full"), over))
     if not without.compass:
         frames = [frame._replace(heading_rad=None) for frame in frames]
-    return live(config, frames, prepare=silencer(without.silence)).ate_m
+    return run_brain(config, frames, prepare=silencer(without.silence)).ate_m
 
 
 def silencer(silence: Mapping[str, Sequence[str]]) -> Callable[[NavigationBrain], None]:

@@ -1,4 +1,4 @@
-"""What the neurons of SSP-SLAM do while a rat's path is walked: grid cells and the others."""
+"""Activity of the neurons of SSP-SLAM along a rat's path: grid cells and other populations."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,14 +13,15 @@ from neuroslam.config.semantic import (
     SSPSLAMConfig,
     SSPSpaceConfig,
 )
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, SpaceError
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import Bins, RateMaps
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.ssp_lives import slam_in, views
+from neuroslam.experiments.ssp_simulation import slam_in, views
 from neuroslam.figures.spikes import Headings, Spikes, plot_rasters, plot_signals, plot_spikes
 from neuroslam.figures.style import save
-from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.populations import VectorPopulation
+from neuroslam.spiking.slam import SSPSLAM, SSPStep
 from neuroslam.worlds.landmark_paths import LandmarkPath, path_of_walk
 from neuroslam.worlds.landmarks import LandmarkWorld, random_world
 from neuroslam.worlds.rodent import read_walk
@@ -41,7 +42,7 @@ REFERENCE = OURS.model_copy(
         "coupling": "none",
     }
 )
-LIVES = {
+CONDITIONS = {
     "ours, corrected": (OURS, True),
     "ours, path integration": (OURS, False),
     "reference's oscillators, corrected": (REFERENCE, True),
@@ -50,49 +51,64 @@ LIVES = {
 """Name -> oscillators, and whether the map corrects them."""
 
 
-class Watched:
-    """Spikes of a life: rate maps of grid cells, and all spikes of a few others."""
+class ActivityLog:
+    """Recorder of spikes: rate maps of grid cells, and all spikes of a few neurons."""
 
     def __init__(self, slam: SSPSLAM, path: LandmarkPath, bins: Bins) -> None:
-        n = slam.grid.n_neurons
         self.slam, self.path = slam, path
-        self.maps = RateMaps(bins, n)
-        self.half: np.ndarray | None = None
+        self.maps = RateMaps(bins, grid_cells(slam).n_neurons)
+        self.half: np.ndarray = np.empty(0)  # grid scores of the first half of the path
         self.spikes: dict[str, list[np.ndarray]] = {p: [] for p in populations(slam)}
         self.errors: list[float] = []
         self.signals: list[tuple[float, float, float]] = []
         self._fired: list[np.ndarray] = []
 
-    def __call__(self, step: int, said: Any) -> None:  # noqa: ANN401 - a step of SSP-SLAM
-        """Take a step."""
+    def __call__(self, step: int, result: SSPStep) -> None:
+        """Record a step."""
         fired = {name: array.spikes for name, array in populations(self.slam).items()}
         self._fired.append(fired["grid cells"][0, 0].numpy().astype(bool))
         for name, kept in self.spikes.items():
             kept.append(_some(fired[name]).numpy().astype(bool))
         at = self.path.position_m[step]
-        self.errors.append(float(np.linalg.norm(said.position_m[0].numpy() - at)))
-        self.signals.append(tuple(float(x[0]) for x in (said.agreement, said.gate, said.recall)))
+        self.errors.append(float(np.linalg.norm(result.position_m[0].numpy() - at)))
+        self.signals.append(
+            (float(result.agreement[0]), float(result.gate[0]), float(result.recall[0]))
+        )
         n, whole = step + 1, len(self.path.position_m)
         if n % _PIECE == 0 or n == whole:
             rate = np.stack(self._fired) / self.path.time_step_s
             self.maps.add(self.path.position_m[n - len(rate) : n], rate)
             self._fired = []
-        if self.half is None and n >= whole / 2:
+        if not len(self.half) and n >= whole / 2:
             self.half = gridness(self.maps.maps())
 
 
+def grid_cells(slam: SSPSLAM) -> VectorPopulation:
+    """Return the grid cells of SSP-SLAM.
+
+    Raises:
+        SpaceError: If it has none.
+    """
+    if slam.grid is None:
+        raise SpaceError("ssp_activity: this SSP-SLAM has no grid cells; set grid_neurons above 0")
+    return slam.grid
+
+
 def populations(slam: SSPSLAM) -> dict[str, Any]:
-    """Return the arrays of neurons that are looked at, by name."""
+    """Return the recorded arrays of neurons by name."""
+    vectors = slam.vectors
+    if vectors is None:
+        raise SpaceError("ssp_activity: no object-vector cells; set vector_neurons above 0")
     return {
-        "grid cells": slam.grid.neurons,
-        "object-vector cells": slam.vectors.neurons,
+        "grid cells": grid_cells(slam).neurons,
+        "object-vector cells": vectors.neurons,
         "memory": slam.map.memory,
         "oscillators": slam.integrator.neurons,
     }
 
 
 def _some(spikes: torch.Tensor) -> torch.Tensor:
-    """Spikes of a few neurons, evenly over all groups."""
+    """Return spikes of a few neurons, evenly over all groups."""
     flat = spikes[:, 0].flatten()
     return flat[torch.linspace(0, len(flat) - 1, _PER_RASTER).long()]
 
@@ -100,61 +116,62 @@ def _some(spikes: torch.Tensor) -> torch.Tensor:
 def ssp_activity(
     data_folder: Path, out_folder: Path, seconds: float = 150.0, grid_neurons: int = 450
 ) -> dict[str, Any]:
-    """Watch neurons along a rat's path, with and without corrections by the map (Fig. 7).
+    """Record neurons along a rat's path, with and without corrections by the map (Fig. 7).
 
-    The path is the one by Sargolini and others that comes with RatInABox, where that is installed,
-    else the one in the data.
+    The path is that of Sargolini et al. in RatInABox, if installed, else the one in the data.
 
     Args:
-        data_folder: With recordings of rats.
+        data_folder: Folder of recordings of rats.
         out_folder: ``results.json``, ``spikes.png``, ``rasters.png`` and ``gate.png`` are written
             there.
-        seconds: How long; the paper has 150.
-        grid_neurons: How many grid cells.
+        seconds: Duration; 150 in the paper.
+        grid_neurons: Number of grid cells.
 
     Returns:
-        The content of ``results.json``: ``rows``, one for each life.
+        The content of ``results.json``: ``rows``, one for each condition.
     """
     out = Path(out_folder)
     path, source = rat_path(data_folder, seconds)
     world = random_world(10, seed=3)
     bins = Bins.around(np.array([[-0.9, -0.9], [0.9, 0.9]]), _BIN_M)
-    rows, watched = [], {}
-    for name, (oscillators, corrected) in LIVES.items():
+    rows, logs = [], {}
+    for name, (oscillators, corrected) in CONDITIONS.items():
         slam = slam_in(_config(oscillators, corrected, grid_neurons), world)
-        seen = watched[name] = Watched(slam, path, bins)
-        _walk(slam, world, path, seen)
-        score = gridness(seen.maps.maps())
-        error = np.array(seen.errors)
+        log = logs[name] = ActivityLog(slam, path, bins)
+        _walk(slam, world, path, log)
+        score = gridness(log.maps.maps())
+        error = np.array(log.errors)
         rows.append(
             {
                 "life": name,
-                "gridness_median_half": _median(seen.half),
+                "gridness_median_half": _median(log.half),
                 "gridness_median": _median(score),
                 "cells_scored": int(np.isfinite(score).sum()),
                 "ate_m": float(error.mean()),
                 "error_last_10_s_m": float(error[-round(10 / path.time_step_s) :].mean()),
             }
         )
-    _draw(watched, world, path, out)
+    _draw(logs, world, path, out)
     return write_results(out, {"path": source, "seconds": seconds, "rows": rows})
 
 
 def rat_path(data_folder: Path, seconds: float) -> tuple[LandmarkPath, str]:
-    """Return a rat's path in a box, and whose it is."""
+    """Return a rat's path in a box, and the name of its recording."""
     spec = find_spec("ratinabox")
     file = Path(data_folder) / "sargolini2006_circle1m.npz"
     if spec is not None and spec.origin is not None:
         packaged = Path(spec.origin).parent / "data" / "sargolini.npz"
         file = packaged if packaged.is_file() else file
     if not file.is_file():
-        raise SourceError(f"{file}: no such recording; install neuroslam[rodent], or give --data")
+        raise SourceError(
+            f"{file}: no such recording; install neuroslam[rodent], or give its folder with --data"
+        )
     walk = read_walk(file, rate_hz=50.0)
     return path_of_walk(walk).first(seconds), file.name
 
 
 def _config(oscillators: PathIntegratorConfig, corrected: bool, grid_neurons: int) -> SSPSLAMConfig:
-    more = {} if corrected else {"gain": 0.0, "relocalise_after_s": 0.0}
+    more: dict[str, Any] = {} if corrected else {"gain": 0.0, "relocalise_after_s": 0.0}
     return SSPSLAMConfig(
         space=SSPSpaceConfig(length_scale_m=0.15),
         integrator=oscillators,
@@ -165,12 +182,12 @@ def _config(oscillators: PathIntegratorConfig, corrected: bool, grid_neurons: in
     )
 
 
-def _walk(slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath, watch: Watched) -> None:
+def _walk(slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath, log: ActivityLog) -> None:
     slam.start(torch.from_numpy(path.position_m[:1]))
     slam.run(
         torch.from_numpy(path.velocity_m_s[:, None]),
         views([world], path.position_m[:, None]),
-        watch,
+        log,
         every=1000,
     )
 
@@ -180,27 +197,29 @@ def _median(scores: np.ndarray) -> float:
     return float(np.median(scores)) if len(scores) else float("nan")
 
 
-def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath, out: Path) -> None:
+def _draw(
+    logs: dict[str, ActivityLog], world: LandmarkWorld, path: LandmarkPath, out: Path
+) -> None:
     """Draw spikes on the path as the paper's Fig. 7 does, rasters, and the gate."""
     at, dt = path.position_m, path.time_step_s
     landmarks = np.array([m.position_m for m in world.landmarks])
     fine = at[:: max(1, round(0.02 / dt))]
-    on, off = (watched[f"ours, {k}"] for k in ("corrected", "path integration"))
+    on, off = (logs[f"ours, {k}"] for k in ("corrected", "path integration"))
     scores = gridness(on.maps.maps())
-    cells = np.linspace(0, on.slam.grid.n_neurons - 1, _PER_RASTER).astype(int)
+    cells = np.linspace(0, grid_cells(on.slam).n_neurons - 1, _PER_RASTER).astype(int)
     best = int(np.nanargmax(np.where(np.isfinite(scores[cells]), scores[cells], -2.0)))
     rows: list[list[Spikes | Headings]] = []
-    for life, label in ((on, "Grid cell, map on"), (off, "Grid cell, map off")):
-        fired = np.stack(life.spikes["grid cells"])[:, best]
-        score = gridness(life.maps.maps())[cells[best]]
+    for log, label in ((on, "Grid cell, corrected"), (off, "Grid cell, not corrected")):
+        fired = np.stack(log.spikes["grid cells"])[:, best]
+        score = gridness(log.maps.maps())[cells[best]]
         half = fired[: len(fired) // 2]
         rows.append(
             [
                 Spikes(label, "first half", fine, at[: len(half)][half]),
-                Spikes("The same cell", f"whole time, gridness {score:.2f}", fine, at[fired]),
+                Spikes("The same cell", f"whole path, grid score {score:.2f}", fine, at[fired]),
             ]
         )
-    ours = watched["ours, corrected"]
+    ours = logs["ours, corrected"]
     for name, title in (("object-vector cells", "Object-vector cell"), ("memory", "Memory neuron")):
         spikes = np.stack(ours.spikes[name])
         k = int(np.argsort(spikes.sum(0))[int(0.9 * spikes.shape[1])])
@@ -221,8 +240,8 @@ def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath,
     )
     some = spikes[:, k].nonzero()[0]
     rows[0].append(Spikes("Oscillator neuron", f"{len(some)} spikes", fine, at[some[:4000]]))
-    rows[1].append(Headings("Its rate (Hz) by heading", rates[k]))
-    title = "Neurons along a rat's path: dots where they fired, crosses landmarks"
+    rows[1].append(Headings("Rate (Hz) by heading", rates[k]))
+    title = "Spikes of neurons along a rat's path (dots: spikes, crosses: landmarks)"
     save(plot_spikes(rows, title), out / "spikes.png")
     n = round(_RASTER_S / dt)
     begin = int(np.argmax(np.array(ours.signals)[:, 2] > 0.5))
@@ -231,7 +250,7 @@ def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath,
             {name: np.stack(s[begin : begin + n]) for name, s in ours.spikes.items()},
             dt,
             begin * dt,
-            "Who fires when, as a known landmark comes into view",
+            "Spikes of four populations as a known landmark comes into view",
         ),
         out / "rasters.png",
     )
@@ -241,7 +260,7 @@ def _draw(watched: dict[str, Watched], world: LandmarkWorld, path: LandmarkPath,
         plot_signals(
             np.arange(len(signals)) * 0.01,
             {name: signals[:, i] for i, name in enumerate(names)},
-            "Loop closure: agreement of map and path, gate, strength of what is recalled",
+            "Loop closures: agreement of map and path integration, gate, recall (arbitrary units)",
         ),
         out / "gate.png",
     )

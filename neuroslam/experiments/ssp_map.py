@@ -1,7 +1,7 @@
-"""A semantic map and questions to it: by name, by attribute, by area, by vector."""
+"""Queries of a semantic map: by name, by attribute, by area, by vector."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,40 +13,40 @@ from neuroslam.config.semantic import (
     SSPSpaceConfig,
 )
 from neuroslam.experiments.boundary_cells import write_results
-from neuroslam.experiments.ssp_lives import live, pointers_of, recalled, slam_in, views
+from neuroslam.experiments.ssp_simulation import pointers_of, recalled, simulate, slam_in, views
 from neuroslam.figures.landmarks import Query, plot_area, plot_posterior, plot_queries, plot_vectors
 from neuroslam.figures.style import save
 from neuroslam.spiking import queries
 from neuroslam.spiking.decoding import probability
-from neuroslam.spiking.slam import SSPSLAM
+from neuroslam.spiking.slam import SSPSLAM, SSPStep
 from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
 from neuroslam.worlds.landmarks import LandmarkWorld, paper_world, random_world
 
 _GRID = 81  # points a side of a similarity map
 _RIGHT_M = 0.05
 _SEEN_S = 1.0
-_KEPT = 50  # steps between two looks at the vectors
+_KEPT = 50  # steps between two records of the vectors
 
 
 def ssp_map(
     _data_folder: Path | None,
     out_folder: Path,
     seconds: float = 60.0,
-    tier: str = "spiking",
+    tier: Literal["algebraic", "rate", "spiking"] = "spiking",
     n_random_maps: int = 100,
 ) -> dict[str, Any]:
-    """Learn the paper's world, ask for all that it asks for, and count in random ones.
+    """Map the paper's world, answer the paper's queries, and count answers in random worlds.
 
     Args:
-        _data_folder: None is needed.
+        _data_folder: Not used.
         out_folder: ``results.json``, ``queries.png``, ``vectors.png``, ``area.png``,
             ``whole_map.png`` and ``posterior.png`` are written there (Figs. 3 to 6, and 1).
-        seconds: How long the animal walks; the paper has 60.
-        tier: Of the map that is drawn; the random ones are of vectors alone.
-        n_random_maps: In which questions are counted.
+        seconds: Duration of the walk; 60 in the paper.
+        tier: Tier of the map that is drawn; random maps are algebraic.
+        n_random_maps: Number of random maps.
 
     Returns:
-        The content of ``results.json``: ``rows``, one for each question.
+        The content of ``results.json``: ``rows``, one for each query.
     """
     out, world = Path(out_folder), paper_world()
     path = band_limited_path(seconds, 0.06, seed=5, time_step_s=0.01, reach_m=0.95)
@@ -66,7 +66,7 @@ def ssp_map(
     rows = _answers(slam, world, path, out)
     _vectors(slam, world, vectors, out)
     save(
-        plot_posterior(world, path.position_m, snapshots, "Where the animal believes to be"),
+        plot_posterior(world, path.position_m, snapshots, "Belief about the animal's position"),
         out / "posterior.png",
     )
     rows += count_right(n_random_maps)
@@ -76,7 +76,7 @@ def ssp_map(
 
 
 def similarity_map(slam: SSPSLAM, z: torch.Tensor, points: int = _GRID) -> np.ndarray:
-    """Return how alike a vector and each place of the plane are, ``(n_y, n_x)``."""
+    """Return the similarity of a vector with each position of the plane, ``(n_y, n_x)``."""
     low, high = slam.space.bounds_m.T
     x, y = (torch.linspace(float(a), float(b), points) for a, b in zip(low, high, strict=True))
     at = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).to(low)
@@ -88,25 +88,28 @@ def similarity_map(slam: SSPSLAM, z: torch.Tensor, points: int = _GRID) -> np.nd
         )
 
 
-def _watched(slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath) -> tuple[dict, dict]:
-    """Live along a path; keep beliefs at four times and the vectors to landmarks all the time."""
+def _watched(
+    slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, Any]]:
+    """Run along a path; return beliefs at four times, and the vectors to landmarks over time."""
     path = path.resampled(slam.config.time_step_s)
     n, dt = len(path.position_m), path.time_step_s
     shown = {round(n * share) - 1 for share in (0.05, 0.35, 0.65, 1.0)}
     every = max(1, round(_KEPT * 1e-3 / dt))
-    snapshots, kept = {}, []
+    snapshots: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    kept: list[tuple[int, torch.Tensor]] = []
     cell = float((slam.space.bounds_m[0, 1] - slam.space.bounds_m[0, 0]) / (_GRID - 1)) ** 2
 
-    def watch(step: int, said: object) -> None:
+    def watch(step: int, step_result: SSPStep) -> None:
         if step in shown:
-            alike = torch.from_numpy(similarity_map(slam, said.z[0])).flatten()
+            alike = torch.from_numpy(similarity_map(slam, step_result.z[0])).flatten()
             density, _ = probability(alike, cell)
             snapshots[f"{(step + 1) * dt:.0f} s"] = (
                 density.reshape(_GRID, _GRID).numpy(),
                 path.position_m[step],
             )
         if step % every == every - 1:
-            kept.append((step, queries.vectors_to(slam, said.z[0])))
+            kept.append((step, queries.vectors_to(slam, step_result.z[0])))
 
     slam.start(torch.from_numpy(path.position_m[:1]))
     view = views([world], path.position_m[:, None])
@@ -124,7 +127,7 @@ def _watched(slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath) -> tuple[d
 def _answers(
     slam: SSPSLAM, world: LandmarkWorld, path: LandmarkPath, out: Path
 ) -> list[dict[str, Any]]:
-    """Ask for landmarks, attributes, walls and an area."""
+    """Query landmarks, attributes, walls and an area."""
     words = pointers_of(world, slam.space.n_features, slam.config.seed)
     asked = {
         "BLUE * TRIANGLE": ["BLUE_TRIANGLE"],
@@ -133,30 +136,28 @@ def _answers(
         "WALL": ["WALL"],
     }
     rows, drawn = [], []
-    for words_said, names in asked.items():
-        z = queries.recall(slam, words.parse(words_said))
-        drawn.append(Query(words_said, similarity_map(slam, z), names))
+    for query, names in asked.items():
+        z = queries.recall(slam, words.parse(query))
+        drawn.append(Query(query, similarity_map(slam, z), names))
         truth = np.stack([world.named(name).position_m for name in names])
         if world.named(names[0]).is_point:
             found = queries.places_in(slam.space, z).position_m.numpy(force=True)
             far = np.linalg.norm(found[:, None] - truth, axis=-1)
             error = far.min(0) if len(found) else np.full(len(truth), np.inf)
-            rows.append(
-                {"question": words_said, "places": len(found), "error_m": float(error.max())}
-            )
+            rows.append({"question": query, "places": len(found), "error_m": float(error.max())})
         else:
             region = torch.from_numpy(world.named(names[0]).boxes_m)
             phi = slam.space.region_fourier(region[:, 0], region[:, 1])
             size = torch.from_numpy((region[:, 1] - region[:, 0]).prod(-1).numpy())
             true = (phi * size.unsqueeze(-1).to(phi.real)).sum(0)
             alike = (z * true.conj()).real.sum() / (z.abs().square().sum().sqrt() * _norm(true))
-            rows.append({"question": words_said, "similarity": float(alike)})
-    title = f"What a {slam.config.tier} map answers ({slam.n_neurons} neurons)"
+            rows.append({"question": query, "similarity": float(alike)})
+    title = f"Answers of a map to queries, {slam.config.tier} tier, {slam.n_neurons} neurons"
     save(plot_queries(world, path.position_m, drawn, title), out / "queries.png")
     low, high = np.array([-0.45, -0.45]), np.array([0.9, 0.5])
-    amounts = queries.what(slam, low, high)
+    amounts = queries.what(slam, low.tolist(), high.tolist())
     save(
-        plot_area(world, low, high, amounts, "What is in an area: the memory of places answers"),
+        plot_area(world, low, high, amounts, "Query of an area: landmarks that it contains"),
         out / "area.png",
     )
     for name, amount in amounts.items():
@@ -171,7 +172,7 @@ def _answers(
             )
         )
         parts.append(Query(landmark.pointer, similarity_map(slam, z), [landmark.name]))
-    title = "The whole map in one vector, unbound by each landmark's pointer"
+    title = "The whole map as one vector, unbound by the pointer of each landmark"
     save(plot_queries(world, None, parts, title), out / "whole_map.png")
     return rows
 
@@ -180,8 +181,8 @@ def _norm(z: torch.Tensor) -> torch.Tensor:
     return z.abs().square().sum().sqrt()
 
 
-def _vectors(slam: SSPSLAM, world: LandmarkWorld, kept: dict, out: Path) -> None:
-    """Draw the vectors to points and how wrong they were."""
+def _vectors(slam: SSPSLAM, world: LandmarkWorld, kept: dict[str, Any], out: Path) -> None:
+    """Draw the vectors to point landmarks and their errors."""
     points = [k for k, landmark in enumerate(world.landmarks) if landmark.is_point]
     names = [world.names[k] for k in points]
     alike, far, arrows = {}, {}, {}
@@ -205,13 +206,13 @@ def _vectors(slam: SSPSLAM, world: LandmarkWorld, kept: dict, out: Path) -> None
         alike,
         far,
         {name: float(kept["first_s"][k]) for k, name in zip(points, names, strict=True)},
-        "Vectors to landmarks",
+        "Vectors to landmarks, and their errors over time",
     )
     save(figure, out / "vectors.png")
 
 
 def _beyond(slam: SSPSLAM, z: torch.Tensor) -> np.ndarray:
-    """Decode vectors between places, which reach twice as far as places do."""
+    """Decode displacements, which reach twice as far as positions."""
     from neuroslam.spiking.decoding import PositionDecoder
     from neuroslam.spiking.space import SSPSpace
 
@@ -223,15 +224,16 @@ def _beyond(slam: SSPSLAM, z: torch.Tensor) -> np.ndarray:
 def count_right(
     n_maps: int, noise_rad: float = 0.0, seconds: float = 120.0
 ) -> list[dict[str, Any]]:
-    """Count right answers in random maps: ten landmarks of five colours and five shapes each.
+    """Count correct answers in random maps: ten landmarks of five colours and five shapes each.
 
-    A question for an attribute is right if as many places come back as have been seen for a second,
-    each within 5 cm of its own. One for an area is right if it tells all such landmarks right.
+    The answer to an attribute is correct if it has as many positions as landmarks that were in view
+    for a second, each within 5 cm. The answer to an area is correct if it is so for all of those
+    landmarks.
 
     Args:
-        n_maps: How many; they are lived side by side.
-        noise_rad: Of the phases.
-        seconds: How long each is explored.
+        n_maps: Number of maps, in one batch.
+        noise_rad: Standard deviation of the phase noise.
+        seconds: Duration of the exploration of each.
     """
     if n_maps < 1:
         return []
@@ -247,14 +249,16 @@ def count_right(
         band_limited_path(seconds, 0.08, seed=1000 + k, time_step_s=0.01) for k in range(n_maps)
     ]
     slam = slam_in(config, worlds[0], n_maps)
-    life = live(slam, worlds, paths)
-    seen = life.seen_s > _SEEN_S
+    simulation = simulate(slam, worlds, paths)
+    seen = simulation.seen_s > _SEEN_S
     truth = np.array([[m.position_m for m in world.landmarks] for world in worlds])
     wrong = np.linalg.norm(recalled(slam) - truth, axis=-1)
     names = [m.pointer for m in worlds[0].landmarks]
     attributes = sorted({word for name in names for word in name.split(" * ")})
     draw = np.random.default_rng(0)
-    right = {"attribute": [], "area, memory of places": [], "area, places recalled": []}
+    right: dict[str, list[bool]] = {
+        "attribute": [], "area, memory of places": [], "area, places recalled": [],
+    }  # fmt: skip
     for k in range(n_maps):
         found_all = []
         for word in attributes:
@@ -267,12 +271,13 @@ def count_right(
         right["attribute"].append(all(found_all))
         middle, half = draw.uniform(-0.5, 0.5, 2), draw.uniform(0.25, 0.45, 2)
         low, high = middle - half, middle + half
+        box = low.tolist(), high.tolist()
         inside = ((truth[k] >= low) & (truth[k] <= high)).all(-1)
-        amounts = np.array(list(queries.what(slam, low, high, k).values()))
+        amounts = np.array(list(queries.what(slam, *box, k).values()))
         right["area, memory of places"].append(bool(((amounts > 0.5) == inside)[seen[k]].all()))
-        told = queries.landmarks_in(slam, low, high, k)
-        told = np.array([name in told for name in slam.names])
-        right["area, places recalled"].append(bool((told == inside)[seen[k]].all()))
+        recalled_names = queries.landmarks_in(slam, *box, k)
+        within = np.array([name in recalled_names for name in slam.names])
+        right["area, places recalled"].append(bool((within == inside)[seen[k]].all()))
     rows = [
         {"question": f"{what}, random maps", "maps": n_maps, "right": int(np.sum(answers))}
         for what, answers in right.items()

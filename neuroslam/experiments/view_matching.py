@@ -1,8 +1,8 @@
-"""Recognising places of a corridor walked twice: which template tells them apart best?
+"""Place recognition by several kinds of templates in a corridor that was walked twice.
 
-The recording is 84 photographs and a matrix that marks, below its diagonal, the pairs that show one
-place: those 38 to 42 photographs apart, and at the end 79 to 81. Photographs next to each other are
-not marked although they look alike, so pairs fewer than 20 apart count neither way.
+The recording is 84 photographs and a matrix that marks, below its diagonal, the pairs of the same
+place: those 38 to 42 photographs apart, and at the end 79 to 81. Successive photographs are not
+marked although they are similar, so pairs fewer than 20 apart are ignored.
 """
 
 import json
@@ -31,7 +31,7 @@ from neuroslam.view.search import distances as sums_of_differences
 from neuroslam.view.templates import to_bytes
 
 APART = 20
-"""Photographs nearer in time than this are no question."""
+"""Least number of photographs between two that are compared."""
 
 NORMALISATIONS: dict[str, dict[str, float]] = {
     "plain": {"normalisation": 0.0},
@@ -40,10 +40,10 @@ NORMALISATIONS: dict[str, dict[str, float]] = {
 }
 
 SIZES = ((32, 24, 8), (16, 12, 4), (64, 12, 16))
-"""Width and height of the templates, columns they may be shifted by; the first is drawn."""
+"""Width and height of the templates, largest shift in columns; the first is drawn."""
 
 NETWORK_SIZES = ((16, 64, 4), (32, 24, 8))
-"""The same of networks: they have few columns, and a row is not one of the picture."""
+"""The same for networks: they have few columns, and rows do not correspond to the picture's."""
 
 
 def view_matching(
@@ -51,22 +51,23 @@ def view_matching(
 ) -> dict[str, Any]:
     """Match every photograph with the earlier ones, for each kind of template.
 
-    Two questions: of all pairs, which show one place (``pairs``)? And, as a robot asks it, is the
-    nearest earlier view this place (``nearest``; recall counts photographs that have one)?
+    ``pairs`` classifies all pairs as the same place or not. ``nearest`` classifies the nearest
+    earlier view, as a robot does; its recall counts photographs that have a correct match.
 
     Args:
         data_folder: Holds ``frames/`` and ``loop_truth.bmp``.
         out_folder: ``results.json`` and ``pr_curves.png`` are written there.
-        networks: To be compared too: ``view.features`` -> file of the weights.
+        networks: Networks to compare too: ``view.features`` -> file of the weights.
 
     Returns:
         The content of ``results.json``: ``rows``.
 
     Raises:
-        SourceError: If a photograph or the truth cannot be read, or they do not fit.
+        SourceError: If a photograph or the truth cannot be read, or their numbers differ.
         ConfigError: If a network cannot be loaded.
     """
-    images = [frame.image for frame in open_source(Path(data_folder) / "frames").frames()]
+    frames = open_source(Path(data_folder) / "frames").frames()
+    images = [frame.image for frame in frames if frame.image is not None]
     truth = read_truth(Path(data_folder) / "loop_truth.bmp", len(images))
     rows, curves = [], {}
     for name, drawn, config in _kinds(networks or {}):
@@ -93,14 +94,14 @@ def view_matching(
     write_atomically(out / "results.json", lambda file: file.write_text(text, encoding="utf-8"))
     figure = plot_precision_recall(curves)
     with mpl.rc_context(STYLE):
-        write_title(figure.axes[0], "Is the nearest view this place?", "")
+        write_title(figure.axes[0], "Place recognition by the nearest view", "")
     save(figure, out / "pr_curves.png")
     return result
 
 
 def _kinds(networks: Mapping[str, str | Path]) -> Iterator[tuple[str, bool, ViewConfig]]:
-    """Name each kind of template, whether it is drawn, and its config."""
-    kinds: list[tuple[str, tuple, dict[str, Any]]] = [
+    """Yield the name of each kind of template, whether it is drawn, and its config."""
+    kinds: list[tuple[str, tuple[tuple[int, int, int], ...], dict[str, Any]]] = [
         (name, SIZES, normalisation) for name, normalisation in NORMALISATIONS.items()
     ]
     for name, weights in networks.items():
@@ -116,10 +117,10 @@ def _kinds(networks: Mapping[str, str | Path]) -> Iterator[tuple[str, bool, View
 
 
 def read_truth(path: Path, n: int) -> np.ndarray:
-    """Read which pairs show one place: boolean, ``(n, n)``, below the diagonal.
+    """Read the pairs that show the same place: boolean, ``(n, n)``, below the diagonal.
 
     Raises:
-        SourceError: If it cannot be read or is not ``n`` by ``n``.
+        SourceError: If the file cannot be read or is not ``n`` by ``n``.
     """
     marks = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if marks is None or marks.shape != (n, n):
@@ -141,21 +142,21 @@ def distance_matrix(images: list[np.ndarray], config: ViewConfig) -> np.ndarray:
     return np.array(nearest) / (255.0 * geometry.n_pixels)
 
 
-def _asked(n: int) -> np.ndarray:
+def _compared(n: int) -> np.ndarray:
     i, j = np.indices((n, n))
-    return i - j >= APART
+    return np.greater_equal(i - j, APART)
 
 
 def pair_curve(distances: np.ndarray, truth: np.ndarray) -> PrecisionRecall:
-    """Rank all pairs that are asked about by their distance."""
-    asked = _asked(len(truth))
-    return precision_recall(distances[asked], truth[asked])
+    """Return precision and recall of all compared pairs by their distance."""
+    compared = _compared(len(truth))
+    return precision_recall(distances[compared], truth[compared])
 
 
 def nearest_curve(distances: np.ndarray, truth: np.ndarray) -> PrecisionRecall:
-    """Rank each picture's nearest earlier one; pictures of a new place should find none."""
-    asked = _asked(len(truth))
-    some = np.flatnonzero(asked.any(axis=1))
-    at = np.where(asked, distances, np.inf)[some].argmin(axis=1)
-    findable = int((truth & asked).any(axis=1).sum())
-    return precision_recall(distances[some, at], truth[some, at], findable)
+    """Return precision and recall of each picture's nearest earlier one."""
+    compared = _compared(len(truth))
+    some = np.flatnonzero(compared.any(axis=1))
+    at = np.where(compared, distances, np.inf)[some].argmin(axis=1)
+    n_correct = int((truth & compared).any(axis=1).sum())
+    return precision_recall(distances[some, at], truth[some, at], n_correct)

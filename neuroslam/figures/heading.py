@@ -70,9 +70,10 @@ def plot_tuning(
             all_cells.plot(heading_deg, curve, color=colour, lw=1.8, label=name)
         all_cells.set(xlabel="heading (°)", ylabel="firing rate / peak rate", xlim=(0, 360))
         all_cells.set_xticks(range(0, 361, 60))
-        all_cells.set_ylim(0.0, 1.08)
+        all_cells.set_ylim(0.0, 1.42)
+        all_cells.set_yticks(np.linspace(0.0, 1.0, 6))
         write_title(all_cells, "Five cells")
-        all_cells.legend(loc="upper right", fontsize=8, ncols=1, title="preferred direction")
+        all_cells.legend(loc="upper center", fontsize=8, ncols=5, title="preferred direction")
         curve = list(rates.values())[-1]
         middle = heading_deg[int(curve.argmax())]
         away = (heading_deg - middle + 180.0) % 360.0 - 180.0

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -120,7 +121,7 @@ def plot_errors(
         axes.grid(visible=False, axis="x")
         axes.set(ylabel="mean position error (cm)")
         write_title(axes, "Position error, not aligned", "bars: mean over seeds; whiskers: sd")
-        key = [Patch(color=colour_of(method), label=method) for method in errors_m]
+        key: list[Artist] = [Patch(color=colour_of(method), label=method) for method in errors_m]
         key += _marks(marks_m)
         figure.legend(handles=key, loc="outside lower center", ncols=len(key))
     return figure

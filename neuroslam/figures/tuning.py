@@ -67,12 +67,10 @@ def plot_tuning(tuning: Tuning, name: str) -> Figure:
         _draw_maps(axes[1, 0], tuning)
         unit = "arbitrary unit" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
         turned = _turned(after.track_xy, before.track_xy)
-        _draw_track(
-            axes[1, 1], _counts(before), before.track_xy, "Map with the config before", unit
-        )
-        _draw_track(axes[1, 2], _counts(after), turned, "Map with the config found", unit)
+        _draw_track(axes[1, 1], _counts(before), before.track_xy, "Map before", unit)
+        _draw_track(axes[1, 2], _counts(after), turned, "Map found", unit)
         if turned is not after.track_xy:
-            axes[1, 2].set_xlabel(f"x ({unit}), turned to align with the map before")
+            axes[1, 2].set_xlabel(f"x ({unit}), aligned to the map before")
     return figure
 
 

@@ -12,8 +12,8 @@ from neuroslam.experiments.compare import (
     SENSES,
     compare,
     config_of,
-    live,
     pixel_landmarks,
+    run_brain,
 )
 from neuroslam.figures.comparison import plot_losses
 from neuroslam.figures.style import render
@@ -24,26 +24,31 @@ from neuroslam.sensors import open_source
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("compare")
     methods = ["RatSLAM", "SLRB", "full"]
-    with pytest.MonkeyPatch.context() as patch:  # who loses a sense drives six laps, here short
+    with pytest.MonkeyPatch.context() as patch:  # six laps, here short, with a failing sensor
         quick = f"{SENSES}&frames_per_lap=50&width=64&height=40"
         patch.setattr("neuroslam.experiments.compare.SENSES", quick)
-        told = compare(
+        written = compare(
             None, out, ["corridor"], [0], laps=1, methods=methods, losses=["nothing is lost"]
         )
-    return told, out
+    return written, out
 
 
-def test_each_method_is_told_with_its_error_and_its_cost(results):
-    told, out = results
-    assert json.loads((out / "results.json").read_text())["rows"] == told["rows"]
-    assert [row["method"] for row in told["rows"]] == ["odometry alone", "RatSLAM", "SLRB", "full"]
-    assert all(0.0 <= row["ate_m"] < 1.0 for row in told["rows"])
-    assert all(row["cpu_ms"] > 0 and row["places"] > 0 for row in told["rows"][1:])
+def test_each_method_has_a_row_with_its_error_and_cost(results):
+    written, out = results
+    assert json.loads((out / "results.json").read_text())["rows"] == written["rows"]
+    assert [row["method"] for row in written["rows"]] == [
+        "odometry alone",
+        "RatSLAM",
+        "SLRB",
+        "full",
+    ]
+    assert all(0.0 <= row["ate_m"] < 1.0 for row in written["rows"])
+    assert all(row["cpu_ms"] > 0 and row["places"] > 0 for row in written["rows"][1:])
     for name in ("comparison.png", "losses.png"):
         assert (out / name).stat().st_size > 10_000
 
 
-def test_what_is_lost_is_told_of_the_whole_drive_and_of_its_end(results):
+def test_errors_with_a_failing_sensor_are_of_the_whole_drive_and_of_the_last_lap(results):
     for row in results[0]["losses"]:
         assert row["ate_last_lap_m"] <= row["largest_error_m"]
         assert row["ate_m"] <= row["largest_error_m"]
@@ -67,17 +72,17 @@ def test_methods_are_what_their_names_say():
         config_of("EKF")
 
 
-def test_a_drive_without_a_camera_for_a_while_still_comes_home():
+def test_a_drive_without_a_camera_for_a_while_still_closes_its_loop():
     spec = "world:corridor?width=64&height=40&frames_per_lap=120&noise=0.05&compass_deg=3&laps=2"
     more = "&ranges=36&markers=12&landmark_reach=6&dark=6-14"
-    dark = live(config_of("full"), list(open_source(spec + more)))
+    dark = run_brain(config_of("full"), list(open_source(spec + more)))
     assert dark.ate_m < 0.5
-    blind = live(config_of("RatSLAM"), list(open_source(spec + more)))
+    blind = run_brain(config_of("RatSLAM"), list(open_source(spec + more)))
     assert dark.ate_m < blind.ate_m
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_what_a_world_can_lose_is_lost(loss):
+def test_a_failing_sensor_is_absent_from_the_frames(loss):
     spec = "world:corridor?laps=6&width=32&height=16&ranges=8&" + LOSSES[loss]
     source = open_source(spec)
     before, during = source.frame(650), source.frame(1010)
@@ -95,7 +100,7 @@ def test_what_a_world_can_lose_is_lost(loss):
     assert before.image.max() > 0
 
 
-def test_markers_in_pictures_serve_as_landmarks_that_a_sensor_tells(tmp_path):
+def test_markers_in_pictures_are_landmarks_like_those_of_a_sensor(tmp_path):
     rows = pixel_landmarks(None, tmp_path, seeds=[0], laps=0.15)["rows"]
     assert {row["landmarks"] for row in rows} == set(LANDMARKS)
     assert all(0.0 <= row["ate_m"] < 0.5 for row in rows)

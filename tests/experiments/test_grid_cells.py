@@ -1,4 +1,4 @@
-"""Boundary cells on their ways to walls; grid cells of short lives, and what is written of them."""
+"""Boundary cells on paths to walls; grid cells in short simulations; written results."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from neuroslam.config import BoundaryCellConfig, BrainConfig, GridCellConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import rate_map
 from neuroslam.experiments import boundary_cells, grid_cells, grid_comparison
-from neuroslam.experiments.census import Gatherer, arena_bins, by_seed, live_grid, median
+from neuroslam.experiments.census import CensusRecorder, arena_bins, by_seed, median, simulate_grid
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
@@ -42,7 +42,7 @@ def hexagons(positions, spacing_m):
     return np.maximum(np.cos(positions @ waves.T).sum(axis=1), 0.0)
 
 
-def test_activity_grows_near_a_wall_fades_farther_off_and_ends_beyond_reach(approaches):
+def test_activity_grows_near_a_wall_decreases_farther_away_and_is_0_beyond_reach(approaches):
     for letter in "CBE":
         way = approaches[letter]
         change = np.diff(way.activity, prepend=0.0)
@@ -51,7 +51,7 @@ def test_activity_grows_near_a_wall_fades_farther_off_and_ends_beyond_reach(appr
         assert not way.activity[way.zone == INHIBITION].any()
 
 
-def test_on_the_way_to_a_wall_cells_are_silent_until_half_their_reach(approaches):
+def test_on_a_path_to_a_wall_cells_are_silent_until_half_their_reach(approaches):
     for letter in "ADF":
         way = approaches[letter]
         assert not way.activity[way.distance_m > 0.15].any()
@@ -78,7 +78,7 @@ def test_at_a_corner_cells_of_both_walls_fire(approaches):
     assert bearings("D") >= {0, 90}
 
 
-def test_the_bearing_of_a_curved_wall_turns_on_the_way(approaches):
+def test_the_bearing_of_a_curved_wall_changes_along_the_path(approaches):
     way = approaches["E"]
     best = 15 * way.rates.argmax(axis=1)[(way.activity > 0)]
     assert best[5] == 30
@@ -101,18 +101,18 @@ def test_the_scenarios_are_written_and_are_as_in_the_paper(tmp_path):
     assert all((tmp_path / f"{name}.png").is_file() for name in ("scenarios", "firing_maps"))
 
 
-def test_what_is_no_number_is_written_as_null(tmp_path):
+def test_nan_is_written_as_null(tmp_path):
     boundary_cells.write_results(tmp_path, {"rows": [{"score": math.nan}]})
     assert json.loads((tmp_path / "results.json").read_text()) == {"rows": [{"score": None}]}
 
 
 def test_a_census_scores_the_map_since_the_start_and_that_since_the_one_before(walk):
-    gatherer = Gatherer(walk, [120.0, 240.0], (1, 1, 2))
+    recorder = CensusRecorder(walk, [120.0, 240.0], (1, 1, 2))
     steady = hexagons(walk.positions, 0.5)
     drifts = np.where(walk.times_s <= 120.0, steady, hexagons(walk.positions + 0.15, 0.5))
     for step, rates in enumerate(np.stack([steady, drifts], axis=1)):
-        gatherer.add(step, rates)
-    early, late = gatherer.census
+        recorder.add(step, rates)
+    early, late = recorder.census
     np.testing.assert_array_equal(early.silent, early.last)
     whole = rate_map(walk.positions, np.float32(steady), arena_bins(walk))
     np.testing.assert_allclose(late.maps[0, 0], whole[0])
@@ -131,7 +131,7 @@ def test_a_median_is_taken_over_cells_and_averaged_over_seeds():
 
 
 def test_grid_cells_become_hexagonal_as_an_arena_is_explored(walk):
-    (early, late), errors = live_grid(
+    (early, late), errors = simulate_grid(
         walk, [0], [30.0, 240.0], BrainConfig(grid_cells=FEW), NO_NOISE
     )
     assert median(early.silent) < 0.6
@@ -139,7 +139,7 @@ def test_grid_cells_become_hexagonal_as_an_arena_is_explored(walk):
     assert errors.shape == (1, len(walk.times_s))
 
 
-def test_the_other_models_sense_what_ours_do(walk):
+def test_the_other_models_have_the_same_senses(walk):
     exact = grid_comparison.sensed_velocity(sense(walk)).numpy()
     way = np.diff(walk.positions, axis=0)
     np.testing.assert_allclose(exact[1:, 0] / walk.rate_hz, way, atol=1e-9)

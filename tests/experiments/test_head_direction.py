@@ -23,7 +23,7 @@ def test_it_writes_its_rows_and_its_figures(measured):
     }  # fmt: skip
 
 
-def test_what_it_measures_is_what_the_page_says(measured):
+def test_the_results_are_those_of_the_docs(measured):
     value = measured[2]
     assert value["tuning_width_at_half_height_deg"] == pytest.approx(46.05, abs=0.01)
     assert value["tuning_width_at_2_percent_deg"] == pytest.approx(99.08, abs=0.01)

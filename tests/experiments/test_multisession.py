@@ -8,8 +8,8 @@ import pytest
 
 from neuroslam.config import build_config
 from neuroslam.experiments import multisession, run_experiment
-from neuroslam.experiments.lives import live
 from neuroslam.experiments.multisession import PLANS, run_plan, wrong_merges
+from neuroslam.experiments.session_runs import run_session
 from neuroslam.sensors import open_source
 
 
@@ -56,14 +56,14 @@ def test_an_experiment_writes_its_rows_its_merges_and_its_figures(tour):
 
 
 @pytest.mark.parametrize("cells", ["none", "shift"])
-def test_pose_cells_that_are_not_moved_and_turned_make_known_places_anew(cells, opened, tour):
-    """Figure 12 of the paper; its own shift alone leaves the ways turned by the new heading."""
+def test_pose_cells_that_are_not_moved_and_turned_create_experiences_twice(cells, opened, tour):
+    """Figure 12 of the paper; its own shift alone leaves the links turned by the new heading."""
     source = opened(PLANS["virtual-tour"].source)
     (first, stop), (again, _) = PLANS["virtual-tour"].cuts(source)
     config = build_config({"sessions": {"cells": cells}})
-    stored = live(source.frames(first, stop), config).brain
-    joined = live(source.frames(again, again + 500), config, stored)  # more than a lap
-    assert joined.created_at_known > 0
+    stored = run_session(source.frames(first, stop), config).brain
+    joined = run_session(source.frames(again, again + 500), config, stored)  # more than a lap
+    assert joined.created_at_known_views > 0
     assert joined.brain.map.n > tour[1][0]["experiences"]
 
 
@@ -96,16 +96,16 @@ def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
 
 
 @pytest.mark.parametrize(("name", "k"), [("circuit_launch", 2), ("circuit_launch", 5)])
-def test_a_real_drive_in_sessions_has_the_shape_of_the_whole(name, k, shared):
-    from neuroslam.experiments.lives import measure
+def test_a_real_drive_in_sessions_has_the_shape_of_a_single_session(name, k, shared):
     from neuroslam.experiments.multisession import Plan, equal_parts
+    from neuroslam.experiments.session_runs import measure
 
     source = shared / "data" / name / "frames.tar"
     if not source.is_file():
         pytest.skip(f"no {name} beside the checkout")
     result = run_plan(Plan(name, str(source), equal_parts(k), preset="rc_car"))
     every = np.arange(len(result.single.trace["session"]))
-    row = measure("", result.lives, result.single, every)
+    row = measure("", result.runs, result.single, every)
     assert row["maps_not_joined"] == 0
     assert row["icp_rmse_rigid_of_diagonal"] < 0.03
     assert row["track_rmse_of_diagonal"] < 0.03

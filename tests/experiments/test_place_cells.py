@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuroslam.experiments import place_cells as experiment
-from neuroslam.experiments import place_lives as lives
-from neuroslam.experiments.animals import live, live_with, read_track
+from neuroslam.experiments import place_methods
+from neuroslam.experiments.animals import read_track, run_cells, simulate
 from neuroslam.figures.place_errors import Spread
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
 
@@ -43,52 +43,66 @@ def test_results_and_figures_are_written(short):
         assert path.stat().st_size > 20_000, path.name
 
 
-def test_every_method_is_told_under_its_conditions(short):
+def test_every_method_has_rows_for_its_conditions(short):
     results, _ = short
     methods = [(row["condition"], row["method"]) for row in results["rows"]]
     assert len(methods) == len(set(methods)) == 9
-    assert sum(method == lives.SLRB for _, method in methods) == 3
+    assert sum(method == place_methods.SLRB for _, method in methods) == 3
     assert all(len(row) <= 9 for row in results["rows"])
     assert results["paper"]["mean_error_m"] == 0.031
 
 
-def test_path_integration_is_the_measure_of_all(short):
-    for condition in (lives.FULL, lives.WEAK):
-        row = row_of(short[0], condition, lives.PATH)
+def test_errors_are_relative_to_path_integration(short):
+    for condition in (place_methods.FULL, place_methods.WEAK):
+        row = row_of(short[0], condition, place_methods.PATH)
         assert row["ratio_to_path_integration"] == pytest.approx(1.0)
         assert row["ratio_aligned"] == pytest.approx(1.0)
 
 
 def test_the_integrator_without_walls_is_path_integration(short):
-    for condition in (lives.FULL, lives.WEAK):
-        path, hebb = (row_of(short[0], condition, m) for m in (lives.PATH, lives.HEBB))
+    for condition in (place_methods.FULL, place_methods.WEAK):
+        path, hebb = (
+            row_of(short[0], condition, m) for m in (place_methods.PATH, place_methods.HEBB)
+        )
         assert hebb["mean_error_m"] == pytest.approx(path["mean_error_m"], abs=1e-6)
         assert hebb["winner_mean_error_m"] > hebb["mean_error_m"]
 
 
 def test_walls_reduce_the_error(short):
-    slrb = row_of(short[0], lives.FULL, lives.SLRB)
+    slrb = row_of(short[0], place_methods.FULL, place_methods.SLRB)
     assert slrb["ratio_to_path_integration"] < 1.0
     assert slrb["mean_error_m_below_hebb_percent"] == pytest.approx(
-        100 * (1 - slrb["mean_error_m"] / row_of(short[0], lives.FULL, lives.HEBB)["mean_error_m"])
+        100
+        * (
+            1
+            - slrb["mean_error_m"]
+            / row_of(short[0], place_methods.FULL, place_methods.HEBB)["mean_error_m"]
+        )
     )
 
 
 def test_weaker_noise_gives_smaller_errors(short):
-    for method in (lives.PATH, lives.HEBB, lives.RATSLAM, lives.SLRB):
-        strong, weak = (row_of(short[0], c, method) for c in (lives.FULL, lives.WEAK))
+    for method in (
+        place_methods.PATH,
+        place_methods.HEBB,
+        place_methods.RATSLAM,
+        place_methods.SLRB,
+    ):
+        strong, weak = (
+            row_of(short[0], c, method) for c in (place_methods.FULL, place_methods.WEAK)
+        )
         assert weak["mean_error_m"] < strong["mean_error_m"]
 
 
 def test_one_place_cell_responds_beside_a_wall(short):
-    slrb = row_of(short[0], lives.FULL, lives.SLRB)
+    slrb = row_of(short[0], place_methods.FULL, place_methods.SLRB)
     assert slrb["one_cell_share"] > 0.9
     assert 1.0 <= slrb["cells_above_half"] <= slrb["cells_above_half_by_grid_alone"] + 1e-9
 
 
 def test_checks_say_target_and_whether_it_is_met(short):
     results, _ = short
-    row = row_of(results, lives.FULL, lives.SLRB)
+    row = row_of(results, place_methods.FULL, place_methods.SLRB)
     checks = {check["what"]: check for check in results["checks"]}
     assert len(checks) == len(results["checks"]) == 7
     ratio = checks["ratio_to_path_integration"]
@@ -98,24 +112,24 @@ def test_checks_say_target_and_whether_it_is_met(short):
     assert (below["target"], below["met"]) == (">= 57", below["ours"] >= 57)
 
 
-def test_pose_cells_without_noise_find_the_way(data):
+def test_pose_cells_without_noise_follow_the_true_path(data):
     walk = read_track(data, "hafting", 1.0)
-    way = lives.pose_cells_alone(sense(walk, NO_NOISE, [0], k=2))
-    told = walk.positions[0] + way.in_world(way.cells)[0]
-    error = np.linalg.norm(told - walk.positions[way.steps], axis=1)
+    path = place_methods.pose_cells_alone(sense(walk, NO_NOISE, [0], k=2))
+    estimate = walk.positions[0] + path.in_world(path.cells)[0]
+    error = np.linalg.norm(estimate - walk.positions[path.steps], axis=1)
     assert error.mean() < 0.01
     assert error.max() < 0.03
 
 
-def test_neighbours_in_a_batch_do_not_change_where_an_animal_is(data):
+def test_animals_of_a_batch_do_not_affect_each_other(data):
     walk = read_track(data, "triangle", 0.5)
     senses = [sense(walk, SenseNoise().scaled(s), SEEDS, k=2) for s in (1.0, 0.3)]
-    both = lives.stacked(senses)
-    diary = lives.Diary(np.isfinite(both.wall_m[..., 0]), walk.positions[0], 0)
-    live_with(both, experiment.BrainConfig(), diary)
-    alone = live(walk, SEEDS).estimate_m
-    told = diary.estimate[:, :2].transpose(1, 0, 2) + walk.positions[0]
-    np.testing.assert_allclose(told, alone, atol=1e-6)
+    both = place_methods.stacked(senses)
+    log = place_methods.PlaceCellLog(np.isfinite(both.wall_m[..., 0]), walk.positions[0], 0)
+    run_cells(both, experiment.BrainConfig(), log)
+    alone = simulate(walk, SEEDS).estimate_m
+    estimate = log.estimate[:, :2].transpose(1, 0, 2) + walk.positions[0]
+    np.testing.assert_allclose(estimate, alone, atol=1e-6)
 
 
 def test_fewer_place_cells_where_they_must_be_farther_apart(data, tmp_path):
@@ -136,14 +150,14 @@ def test_fewer_place_cells_where_they_must_be_farther_apart(data, tmp_path):
 @given(st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=1, max_size=30))
 def test_cells_are_numbered_by_their_first_visit(track):
     track = np.array(track)
-    cells, first, numbers = lives.visited(track)
+    cells, first, numbers = place_methods.visited(track)
     np.testing.assert_array_equal(cells[numbers], track)
     np.testing.assert_array_equal(cells, track[first])
     assert (np.diff(first) > 0).all()
 
 
 def test_links_join_successive_places_once():
-    assert lives.links_of(np.array([0, 1, 1, 0, 2])).tolist() == [[0, 1], [0, 2]]
+    assert place_methods.links_of(np.array([0, 1, 1, 0, 2])).tolist() == [[0, 1], [0, 2]]
 
 
 def test_growth_is_that_of_the_last_third():

@@ -15,7 +15,7 @@ def pictures(folder):
     return {p.name for p in folder.glob("*.png") if p.stat().st_size > 10_000}
 
 
-def test_a_map_is_asked_and_random_ones_are_counted(tmp_path):
+def test_queries_of_a_map_are_answered_and_counted_in_random_maps(tmp_path):
     found = ssp_map(None, tmp_path, seconds=40.0, tier="algebraic", n_random_maps=3)
     rows = {row["question"]: row for row in found["rows"]}
     assert rows["landmark, random maps"]["right"] == rows["landmark, random maps"]["landmarks"] > 10
@@ -50,7 +50,7 @@ def test_three_dimensions_are_like_two(tmp_path):
     assert pictures(tmp_path) == {"path.png"}
 
 
-def test_kitti_is_reckoned_plainly_and_as_on_a_chip(shared, tmp_path):
+def test_kitti_is_dead_reckoned_in_floating_point_and_quantised(shared, tmp_path):
     found = ssp_kitti(shared / "data" / "kitti_00", tmp_path, seconds=3.0, budgets=(3600,))
     assert [row["integrator"] for row in found["rows"]] == [
         "plain, 3k neurons", "quantised, 3k neurons",
@@ -59,7 +59,7 @@ def test_kitti_is_reckoned_plainly_and_as_on_a_chip(shared, tmp_path):
     assert pictures(tmp_path) == {"reckoning.png"}
 
 
-def test_neurons_are_watched_along_a_rat_s_path(shared, tmp_path):
+def test_neurons_are_recorded_along_a_rat_s_path(shared, tmp_path):
     rows = ssp_activity(shared / "data" / "rodent", tmp_path, seconds=1.5, grid_neurons=45)["rows"]
     assert len(rows) == 4
     assert rows[0]["ate_m"] < 0.05

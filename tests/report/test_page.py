@@ -264,7 +264,7 @@ def test_a_chart_leads_to_a_frame(page):
     assert abs(page.evaluate("chosen.row") - rows / 2) < 0.1 * rows
 
 
-def test_the_merge_is_told_and_shown(page):
+def test_the_merge_is_reported_and_shown(page):
     card = page.locator("#session-list .card").nth(1)
     assert card.locator("h3").inner_text().startswith("Merged at frame ")
     card.locator("button").click()

@@ -6,7 +6,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch.utils.tensorboard import SummaryWriter
 
 from neuroslam.config.semantic import PathIntegratorConfig, SSPSLAMConfig
-from neuroslam.experiments.ssp_lives import slam_in, views
+from neuroslam.experiments.ssp_simulation import slam_in, views
 from neuroslam.runs.panels import SemanticPanels
 from neuroslam.worlds.landmarks import make_world, point
 

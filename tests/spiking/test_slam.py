@@ -12,7 +12,7 @@ from neuroslam.config.semantic import (
     SSPSpaceConfig,
 )
 from neuroslam.errors import CheckpointError, SpaceError
-from neuroslam.experiments.ssp_lives import integrate, live, recalled, slam_in, views
+from neuroslam.experiments.ssp_simulation import integrate, recalled, simulate, slam_in, views
 from neuroslam.spiking import queries
 from neuroslam.spiking.files import load_semantic_map, save_semantic_map
 from neuroslam.spiking.joining import merge_semantic_maps
@@ -56,7 +56,7 @@ WORLD = make_world([point("A", (0.4, 0.0)), point("B", (-0.3, 0.15)), point("C",
 @pytest.mark.parametrize("tier", TIERS)
 def test_a_walk_is_followed_and_what_was_seen_is_recalled(tier):
     slam = slam_in(SSPSLAMConfig(**TIERS[tier]), WORLD)
-    life = live(slam, [WORLD], [circle()])
+    life = simulate(slam, [WORLD], [circle()])
     assert life.error_m.mean() < (1e-3 if tier == "algebraic" else 0.05)
     assert life.seen_s[0, 0] > 0.5
     wrong = np.linalg.norm(recalled(slam)[0] - [m.position_m for m in WORLD.landmarks], axis=-1)
@@ -105,10 +105,10 @@ def test_files_that_are_no_maps_are_refused(tmp_path):
 
 def test_phase_noise_is_part_of_the_state():
     config = SSPSLAMConfig(**VECTORS, integrator=PathIntegratorConfig(phase_noise_rad=0.3))
-    lives = [live(slam_in(config, WORLD), [WORLD], [circle()]) for _ in range(2)]
+    lives = [simulate(slam_in(config, WORLD), [WORLD], [circle()]) for _ in range(2)]
     np.testing.assert_array_equal(lives[0].position_m, lives[1].position_m)
     other = slam_in(config.model_copy(update={"seed": 1}), WORLD)
-    assert not np.allclose(live(other, [WORLD], [circle()]).position_m, lives[0].position_m)
+    assert not np.allclose(simulate(other, [WORLD], [circle()]).position_m, lives[0].position_m)
 
 
 @pytest.fixture
@@ -124,9 +124,9 @@ def test_animals_of_a_batch_live_as_alone():
     config = SSPSLAMConfig(**TIERS["spiking"])
     worlds = [random_world(3, seed=k) for k in range(2)]
     paths = [circle(0.4, 1e-3, laps=0.1), circle(0.4, 1e-3, radius=0.5, laps=-0.1)]
-    both = live(slam_in(config, worlds[0], 2), worlds, paths)
+    both = simulate(slam_in(config, worlds[0], 2), worlds, paths)
     for k in range(2):
-        alone = live(slam_in(config, worlds[0]), worlds[k : k + 1], paths[k : k + 1])
+        alone = simulate(slam_in(config, worlds[0]), worlds[k : k + 1], paths[k : k + 1])
         np.testing.assert_allclose(alone.position_m[:, 0], both.position_m[:, k], atol=1e-12)
 
 
@@ -135,7 +135,7 @@ def test_gradients_reach_scales_gate_and_gain(tier):
     more = {"attention": "nearest"} if tier == "rate" else {}
     slam = slam_in(SSPSLAMConfig(**TIERS[tier], **more), WORLD)
     path = circle(1.2, slam.config.time_step_s, laps=0.02)
-    live(slam, [WORLD], [path])
+    simulate(slam, [WORLD], [path])
     state = slam.state_dict()
     slam = slam_in(slam.config, WORLD)
     slam.load_state_dict(state)
@@ -197,7 +197,7 @@ def test_a_walk_is_the_same_at_two_time_steps():
 @pytest.mark.parametrize("tier", ["algebraic", "spiking"])
 def test_who_is_put_elsewhere_finds_itself_at_a_known_landmark(tier):
     slam = slam_in(SSPSLAMConfig(**TIERS[tier]), WORLD)
-    live(slam, [WORLD], [circle()])
+    simulate(slam, [WORLD], [circle()])
     true = np.array([0.4, 0.05])
     still = LandmarkPath(
         slam.config.time_step_s, np.tile(true, (round(2.5 / slam.config.time_step_s), 1))
@@ -216,7 +216,7 @@ def test_who_is_put_elsewhere_finds_itself_at_a_known_landmark(tier):
 def test_who_may_not_relocalise_stays_lost():
     config = SSPSLAMConfig(**VECTORS, relocalise_after_s=0.0)
     slam = slam_in(config, WORLD)
-    live(slam, [WORLD], [circle()])
+    simulate(slam, [WORLD], [circle()])
     slam.start(torch.tensor([[-0.6, 0.7]]))
     still = np.tile([0.4, 0.05], (300, 1, 1))
     slam.run(torch.zeros(300, 1, 2), views([WORLD], still))
@@ -357,7 +357,7 @@ WRONG = {
 @pytest.mark.parametrize("said", WRONG)
 def test_bad_input_is_refused_and_changes_nothing(said):
     slam = slam_in(SSPSLAMConfig(**VECTORS), WORLD)
-    live(slam, [WORLD], [circle(1.0)])
+    simulate(slam, [WORLD], [circle(1.0)])
     before = {k: v.clone() for k, v in slam.state_dict().items()}
     view = views([WORLD], np.array([[[0.4, 0.0]]]))
     with pytest.raises(SpaceError, match=said) as error:

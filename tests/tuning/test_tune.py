@@ -172,7 +172,7 @@ def test_the_map_found_is_aligned_with_the_map_before_and_numbers_are_plain(tune
     _, templates, _, maps, before, after = figure.get_axes()
     tracks = [axes.get_lines()[0].get_xydata() for axes in (before, after)]
     np.testing.assert_allclose(tracks[1], 1.5 * tracks[0], atol=1e-9)
-    assert after.get_xlabel() == "x (arbitrary unit), turned to align with the map before"
+    assert after.get_xlabel() == "x (arbitrary unit), aligned to the map before"
     scores = {f"{score.average_precision:.3f}" for score in tuning.views}
     assert {text.get_text() for text in templates.texts} <= scores
     render(figure)

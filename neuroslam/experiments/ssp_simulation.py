@@ -1,4 +1,4 @@
-"""Lives of SSP-SLAM in worlds of landmarks: several animals side by side, each in its own."""
+"""Simulation of SSP-SLAM in worlds of landmarks: a batch of animals, each in its own world."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,22 +14,22 @@ from neuroslam.worlds.landmark_paths import LandmarkPath, band_limited_path
 from neuroslam.worlds.landmarks import LandmarkView, LandmarkWorld, make_world, point
 
 KEPT_HZ = 100
-"""Of what is said, so much is kept for figures and figures of merit."""
-_PIECE = 2000  # steps that are seen at once: views of all of a long life do not fit into memory
+"""Rate of the estimates that are kept for figures and errors."""
+_PIECE = 2000  # steps whose views are computed at once: those of a long path do not fit into memory
 TRIAL_SEEDS = (17612, 74607, 8272, 33433, 15456, 64938, 99741, 58916, 61899, 85406)
-"""Of the ten trials that the authors of the reference program ran."""
+"""Seeds of the ten trials of the reference program's authors."""
 
 
-class Life(NamedTuple):
-    """What animals went through and said, at ``KEPT_HZ``.
+class Simulation(NamedTuple):
+    """True and estimated positions of animals, at ``KEPT_HZ``.
 
     Attributes:
         time_s: ``(steps,)``.
         truth_m: ``(steps, animals, dimension)``.
-        position_m: Where each believed to be, the same shape.
+        position_m: Estimated positions, same shape.
         error_m: ``(steps, animals)``.
-        similarity_error: One minus the similarity of its vector to the true one's, the same shape.
-        seen_s: For how long each has seen each landmark, ``(animals, landmarks)``.
+        similarity_error: One minus the similarity to the true vector, same shape.
+        seen_s: Time for which each landmark was in view, ``(animals, landmarks)``.
     """
 
     time_s: np.ndarray
@@ -41,24 +41,24 @@ class Life(NamedTuple):
 
     @property
     def ate_m(self) -> np.ndarray:
-        """Mean distance from the truth, of each animal."""
-        return self.error_m.mean(0)
+        """Mean distance to the truth of each animal, which the paper calls ATE."""
+        return np.asarray(self.error_m.mean(0))
 
 
 def pointers_of(world: LandmarkWorld, n_features: int, seed: int = 0) -> SemanticPointers:
-    """Make the vocabulary of a world: names of landmarks, or what they are made of.
+    """Return the vocabulary of a world: names of landmarks, or the words of their pointers.
 
-    Names alone are orthogonal; what is bound must be unitary.
+    Names are orthogonal; words that are bound must be unitary.
     """
-    said = [landmark.pointer for landmark in world.landmarks]
-    words = sorted({w for s in said for w in s.replace("*", " ").replace("+", " ").split()})
-    structured = any(not s.isidentifier() for s in said)
-    how = "unitary" if structured or len(words) > n_features else "orthogonal"
-    return SemanticPointers(words, n_features, seed, how)
+    pointers = [landmark.pointer for landmark in world.landmarks]
+    words = sorted({w for s in pointers for w in s.replace("*", " ").replace("+", " ").split()})
+    structured = any(not pointer.isidentifier() for pointer in pointers)
+    unitary = structured or len(words) > n_features
+    return SemanticPointers(words, n_features, seed, "unitary" if unitary else "orthogonal")
 
 
 def slam_in(config: SSPSLAMConfig, world: LandmarkWorld, batch: int = 1) -> SSPSLAM:
-    """Make animals that can tell a world's landmarks apart."""
+    """Return a batch of animals with the pointers of a world's landmarks."""
     n_features = 2 * _n_frequencies(config) + 1
     words = pointers_of(world, n_features, config.seed)
     keys = words.parse_all([landmark.pointer for landmark in world.landmarks])
@@ -72,50 +72,58 @@ def _n_frequencies(config: SSPSLAMConfig) -> int:
 
 
 def views(worlds: Sequence[LandmarkWorld], position_m: np.ndarray) -> LandmarkView:
-    """Return what animals see, each in its world, ``(steps, animals, dimension)``."""
+    """Return the views of animals, each in its world, at ``(steps, animals, dimension)``."""
     each = [world.observe(position_m[:, k]) for k, world in enumerate(worlds)]
-    owner = each[0].box_landmark
-    stacked = (np.stack(column, axis=1) for column in list(zip(*each, strict=True))[:4])
-    return LandmarkView(*stacked, owner)
+    return LandmarkView(
+        np.stack([view.in_view for view in each], axis=1),
+        np.stack([view.distance_m for view in each], axis=1),
+        np.stack([view.low_m for view in each], axis=1),
+        np.stack([view.high_m for view in each], axis=1),
+        each[0].box_landmark,
+    )
 
 
-def live(slam: SSPSLAM, worlds: Sequence[LandmarkWorld], paths: Sequence[LandmarkPath]) -> Life:
-    """Let animals go along their paths, from where these begin.
+def simulate(
+    slam: SSPSLAM, worlds: Sequence[LandmarkWorld], paths: Sequence[LandmarkPath]
+) -> Simulation:
+    """Run animals along their paths, from the true start.
 
     Args:
-        slam: Of as many animals.
-        worlds: Of each.
-        paths: Of each, of equal length.
+        slam: A batch of animals.
+        worlds: World of each animal.
+        paths: Path of each animal, of equal length.
     """
-    truth, velocity, every = _ways(slam, paths)
+    truth, velocity, every = _sampled_paths(slam, paths)
     slam.start(torch.from_numpy(truth[0]))
-    said, seen = [], np.zeros((len(paths), len(worlds[0].landmarks)))
+    steps, seen = [], np.zeros((len(paths), len(worlds[0].landmarks)))
     for begin in range(0, len(truth), _PIECE):
         part = slice(begin, begin + _PIECE)
         view = views(worlds, truth[part])
         seen += view.in_view.sum(0) * slam.config.time_step_s
-        said.append(slam.run(velocity[part], view, every=every))
-    whole = SSPStep(*(torch.cat(column) for column in zip(*said, strict=True)))
-    return _life(slam, truth[every - 1 :: every], whole.position_m, whole.z, seen)
+        steps.append(slam.run(velocity[part], view, every=every))
+    whole = SSPStep(*(torch.cat(column) for column in zip(*steps, strict=True)))
+    return _simulation(slam, truth[every - 1 :: every], whole.position_m, whole.z, seen)
 
 
 @torch.inference_mode()
-def integrate(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> Life:
-    """Let the path integrator alone go along paths; the rest of the animals sleeps."""
-    truth, velocity, every = _ways(slam, paths)
+def integrate(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> Simulation:
+    """Run only the path integrators along paths."""
+    truth, velocity, every = _sampled_paths(slam, paths)
     walk = slam.integrator
     walk.start(torch.from_numpy(truth[0]))
-    said = []
+    steps = []
     for k, v in enumerate(velocity.to(slam.pointers)):
         z = walk(v)
         if (k + 1) % every == 0:
-            said.append((walk.position_m, z))
-    position, z = (torch.stack(column) for column in zip(*said, strict=True))
-    return _life(slam, truth[every - 1 :: every], position, z, np.zeros((len(paths), 0)))
+            steps.append((walk.position_m, z))
+    position, z = (torch.stack(column) for column in zip(*steps, strict=True))
+    return _simulation(slam, truth[every - 1 :: every], position, z, np.zeros((len(paths), 0)))
 
 
-def _ways(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> tuple[np.ndarray, torch.Tensor, int]:
-    """True positions, velocities, and of how many steps one is kept."""
+def _sampled_paths(
+    slam: SSPSLAM, paths: Sequence[LandmarkPath]
+) -> tuple[np.ndarray, torch.Tensor, int]:
+    """Return true positions, velocities, and the number of steps for each one kept."""
     dt = slam.config.time_step_s
     every = max(1, round(1.0 / (KEPT_HZ * dt)))
     paths = [path.resampled(dt) for path in paths]
@@ -125,9 +133,9 @@ def _ways(slam: SSPSLAM, paths: Sequence[LandmarkPath]) -> tuple[np.ndarray, tor
     return truth, torch.from_numpy(velocity), every
 
 
-def _life(
+def _simulation(
     slam: SSPSLAM, truth: np.ndarray, position: torch.Tensor, z: torch.Tensor, seen: np.ndarray
-) -> Life:
+) -> Simulation:
     every = max(1, round(1.0 / (KEPT_HZ * slam.config.time_step_s)))
     with torch.inference_mode():
         true_z = slam.space.encode_fourier(torch.from_numpy(truth))
@@ -135,14 +143,14 @@ def _life(
     where = position.double().numpy()
     time = (np.arange(len(truth)) + 1) * every * slam.config.time_step_s
     error = np.linalg.norm(where - truth, axis=-1)
-    return Life(time, truth, where, error, 1.0 - alike.numpy(), seen)
+    return Simulation(time, truth, where, error, 1.0 - alike.numpy(), seen)
 
 
 def recalled(slam: SSPSLAM) -> np.ndarray:
-    """Return where each animal's map has each landmark, ``(animals, landmarks, dimension)``."""
+    """Return the landmarks' positions on the animals' maps, ``(animals, landmarks, dimension)``."""
     with torch.inference_mode():
         z = slam.space.to_fourier(slam.map.read(slam.pointers))
-        return slam.integrator.decoder(z).position_m.double().numpy()
+        return np.asarray(slam.integrator.decoder(z).position_m.double())
 
 
 def trials(data: Path | None, n: int, seconds: float) -> tuple[list[LandmarkPath], LandmarkWorld]:
@@ -150,8 +158,8 @@ def trials(data: Path | None, n: int, seconds: float) -> tuple[list[LandmarkPath
 
     Args:
         data: Folder with ``inputs_T120_limit0.08.npz``; ``None``: random ones.
-        n: How many paths, at most 10.
-        seconds: How long.
+        n: Number of paths, at most 10.
+        seconds: Duration.
     """
     if data is None:
         paths = [band_limited_path(120.0, 0.08, seed=k, time_step_s=0.01) for k in range(n)]

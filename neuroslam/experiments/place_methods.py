@@ -1,4 +1,4 @@
-"""Lives of place cells on rats' tracks, by all methods that are compared, and what they told."""
+"""Place cells on tracks of rats by all methods compared, and their estimates."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,9 +13,9 @@ from neuroslam.cells.boundary_vectors import Wall
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.cells.pose import PoseCellNetwork
-from neuroslam.config import BrainConfig, PoseCellConfig
+from neuroslam.config import BrainConfig, PoseCellConfig, WallMemoryConfig
 from neuroslam.evaluation.ratemap import responding
-from neuroslam.experiments.animals import WALLS, live_with, path_integration, read_track
+from neuroslam.experiments.animals import WALLS, path_integration, read_track, run_cells
 from neuroslam.figures.place_errors import Spread
 from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.types import Motion
@@ -23,32 +23,32 @@ from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import SenseNoise, Senses, sense
 
 FULL, WEAK, EASY = "noise 1.0", "noise 0.3", "noise 1.0, bearings from the compass"
-"""Conditions: how the senses err."""
+"""Conditions: noise of the senses."""
 
 SLRB, HEBB, RATSLAM, PATH = "SLRB", "competitive Hebb", "RatSLAM", "path integration"
 
-NO_WALLS = {"corrects": False}
-"""Of the wall memory: walls neither correct, nor tell that the animal is lost and stop learning."""
+NO_WALLS = WallMemoryConfig(corrects=False)
+"""Walls neither correct the position, nor detect that the animal is lost and stop learning."""
 
 _COUNT_EVERY = 100  # steps between counts of place cells
-_LOOK_EVERY = 80  # steps between looks at all responses
-_POSE_CELL_M = 0.06  # as the place cells: counts of cells can be compared
-_POSE_STEPS = 4  # samples summed to one motion of the pose cells: five a second
+_LOOK_EVERY = 80  # steps between records of all responses
+_POSE_CELL_M = 0.06  # as the place cells, so that numbers of cells can be compared
+_POSE_STEPS = 4  # samples summed to one motion of the pose cells: 5 Hz
 
 
-class Told(NamedTuple):
-    """What a method told of one track under one condition, for every seed.
+class MethodResult(NamedTuple):
+    """Estimates of a method on one track under one condition, for every seed.
 
     Attributes:
         track: Name of the track.
-        condition: How the senses erred.
-        method: Who told it.
-        truth_m: ``(n, 2)``.
-        minutes: When, ``(n,)``.
-        estimate_m: Positions integrated, ``(seeds, n, 2)``.
-        winner_m: Centres of the cells that won, the same shape; ``None`` if it has no cells.
-        cells: Number of cells over time; ``None`` if it has none.
-        more: What else is worth a line.
+        condition: Noise of the senses.
+        method: Name of the method.
+        truth_m: True positions, ``(n, 2)``.
+        minutes: Times, ``(n,)``.
+        estimate_m: Integrated positions, ``(seeds, n, 2)``.
+        winner_m: Centres of the winning cells, same shape; ``None`` for a method without cells.
+        cells: Number of cells over time; ``None`` for a method without cells.
+        more: Further values of the row.
     """
 
     track: str
@@ -62,13 +62,13 @@ class Told(NamedTuple):
     more: Mapping[str, float] = {}
 
 
-class Diary:
-    """Hook that writes down what place cells do in a batch of lives.
+class PlaceCellLog:
+    """Hook that records place cells of a batch of animals.
 
     Args:
-        beside_wall: Who feels a wall, ``(batch, steps)``.
-        start_m: True start, which the cells do not know.
-        early: Step at which the map of the first animal is kept.
+        beside_wall: Whether an animal senses a wall, ``(batch, steps)``.
+        start_m: True start; the estimates start at 0.
+        early: Step at which the map of the first animal is recorded.
     """
 
     def __init__(self, beside_wall: np.ndarray, start_m: np.ndarray, early: int) -> None:
@@ -79,13 +79,13 @@ class Diary:
         self.counted: list[np.ndarray] = []
         self.count_steps: list[int] = []
         self.maps: list[tuple[np.ndarray, np.ndarray]] = []
-        # Cells above half of the strongest, where a wall is felt; by the grid and the position, and
-        # by the grid alone: animal, count.
+        # Animal, and number of cells above half of the highest rate, beside a wall; by the grid
+        # cells and the position, and by the grid cells alone.
         self.above: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
         self.looks: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def __call__(self, i: int, here: NavigationEstimate, cells: NavigationCells) -> None:
-        """Write down a step; a :data:`~neuroslam.experiments.animals.Hook`."""
+        """Record a step; a :data:`~neuroslam.experiments.animals.Hook`."""
         self.estimate[i], self.lost[i] = here.position_m.numpy(), here.lost.numpy()
         self.winner[i] = cells.place.centre_of(here.place).numpy()
         last = i == len(self.estimate) - 1
@@ -112,7 +112,7 @@ class Diary:
             self.looks[i] = centres, both[0][0, :n].copy(), both[1][0, :n].copy()
 
     def single(self, rows: slice) -> dict[str, float]:
-        """Return how often exactly one cell responds beside a wall, and how many do."""
+        """Return how often exactly one cell responds beside a wall, and the mean number."""
         found = {}
         for name, above in zip(("", "_by_grid_alone"), self.above, strict=True):
             animal, n = np.concatenate([np.empty((0, 2), int), *above]).T
@@ -123,10 +123,10 @@ class Diary:
 
 
 def stacked(senses: Sequence[Senses]) -> Senses:
-    """Put animals on one walk side by side, so that a step costs little more than one's.
+    """Stack animals on one walk into one batch, which is faster than one after the other.
 
     Args:
-        senses: Of the same walk.
+        senses: Senses on the same walk.
     """
     columns = ("speed_m_s", "heading_rad", "wall_m", "wall_bearing_rad")
     return senses[0]._replace(
@@ -134,13 +134,13 @@ def stacked(senses: Sequence[Senses]) -> Senses:
     )
 
 
-class PoseCellWay(NamedTuple):
+class PoseCellPath(NamedTuple):
     """Way of the packet of pose cells, in cells from where it started.
 
     Attributes:
-        steps: Of the senses, ``(n,)``, after which it was there.
-        cells: x, y and heading, unwrapped, ``(batch, n, 3)``.
-        turned_rad: From x of the cells to x of the world, ``(batch,)``.
+        steps: Steps of the senses, ``(n,)``.
+        cells: x, y and heading after them, unwrapped, ``(batch, n, 3)``.
+        turned_rad: Angle from x of the cells to x of the world, ``(batch,)``.
     """
 
     steps: np.ndarray
@@ -148,18 +148,17 @@ class PoseCellWay(NamedTuple):
     turned_rad: np.ndarray
 
     def in_world(self, cells: np.ndarray) -> np.ndarray:
-        """Return x and y of such a way in metres from the start, ``(batch, n, 2)``."""
+        """Return x and y of such a path in metres from the start, ``(batch, n, 2)``."""
         cos, sin = np.cos(self.turned_rad)[:, None], np.sin(self.turned_rad)[:, None]
         x, y = _POSE_CELL_M * cells[..., 0], _POSE_CELL_M * cells[..., 1]
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def pose_cells_alone(senses: Senses) -> PoseCellWay:
-    """Let RatSLAM's pose cells integrate what was sensed, five times a second.
+def pose_cells_alone(senses: Senses) -> PoseCellPath:
+    """Run RatSLAM's pose cells on the sensed motion, at 5 Hz.
 
-    Four samples are summed to one motion, whose noise of heading is thereby averaged. No view
-    injects, so the torus may be small: the estimate is unwrapped, and nothing that passes a place a
-    lap away can change it.
+    Four samples are summed to one motion, which averages the noise of the heading. Without
+    injection by views the torus may be small, as the estimate is unwrapped.
     """
     batch, steps = senses.speed_m_s.shape
     n = steps // _POSE_STEPS
@@ -171,24 +170,24 @@ def pose_cells_alone(senses: Senses) -> PoseCellWay:
     turn = wrap_angles(np.diff(heading, axis=1, append=heading[:, -1:]))
     config = PoseCellConfig(n_xy=15, cell_size_m=_POSE_CELL_M)
     cells = PoseCellNetwork(config, batch=batch)
-    told = np.empty((n + 1, batch, 3))
+    estimates = np.empty((n + 1, batch, 3))
     with torch.inference_mode():
-        told[0] = cells.estimate.numpy()
+        estimates[0] = np.asarray(cells.estimate)
         for i, motion in enumerate(zip(distance.T, turn.T, strict=True)):
             v, w = (torch.from_numpy(np.ascontiguousarray(x)) for x in motion)
-            told[i + 1] = cells.integrate(Motion(v, w, 1.0)).numpy()
+            estimates[i + 1] = np.asarray(cells.integrate(Motion(v, w, 1.0)))
     torus = np.array([config.n_xy, config.n_xy, config.n_theta])
-    steps_told = (np.diff(told, axis=0) + torus / 2) % torus - torus / 2
-    way = np.cumsum(steps_told, axis=0).transpose(1, 0, 2)
-    turned = heading[:, 0] - TWO_PI * told[0, :, 2] / config.n_theta  # it starts along -x
-    return PoseCellWay(np.arange(1, n + 1) * _POSE_STEPS - 1, way, turned)
+    displacements = (np.diff(estimates, axis=0) + torus / 2) % torus - torus / 2
+    path = np.cumsum(displacements, axis=0).transpose(1, 0, 2)
+    turned = heading[:, 0] - TWO_PI * estimates[0, :, 2] / config.n_theta  # it starts along -x
+    return PoseCellPath(np.arange(1, n + 1) * _POSE_STEPS - 1, path, turned)
 
 
 def visited(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Number the cells of a track ``(n, k)``, whole numbers, in the order of their first visit.
 
     Returns:
-        The cells, ``(m, k)``; when each was first visited, ``(m,)``; number at each step, ``(n,)``.
+        The cells, ``(m, k)``; step of each first visit, ``(m,)``; number at each step, ``(n,)``.
 
     Example:
         >>> visited(np.array([[2, 0], [1, 0], [2, 0]]))[1:]
@@ -201,18 +200,18 @@ def visited(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def links_of(numbers: np.ndarray) -> np.ndarray:
-    """Return pairs of places visited in succession, each once, ``(m, 2)``."""
+    """Return pairs of cells visited in succession, each once, ``(m, 2)``."""
     pairs = np.sort(np.column_stack([numbers[:-1], numbers[1:]]), axis=1)
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
 
 
 class TrackResult(NamedTuple):
-    """All that was told of one track, and what its figures need."""
+    """Results of all methods on one track, and the data of its figures."""
 
     name: str
     walk: Walk
-    told: list[Told]
-    diaries: dict[str, Diary]
+    results: list[MethodResult]
+    logs: dict[str, PlaceCellLog]
     walls: Wall
     pose_maps: list[tuple[np.ndarray, np.ndarray]]
     early_min: float
@@ -221,7 +220,7 @@ class TrackResult(NamedTuple):
 def run_track(
     data: Path, name: str, minutes: float = 30.0, seeds: Sequence[int] = range(10)
 ) -> TrackResult:
-    """Let all methods tell one track under all conditions."""
+    """Run all methods on one track under all conditions."""
     walk = read_track(data, name, minutes)
     look = partial(sense, walk, seeds=seeds, k=WALLS)
     senses = {
@@ -231,55 +230,61 @@ def run_track(
     }
     k, at_min = len(seeds), walk.times_s / 60.0 - walk.times_s[0] / 60.0
     early = int(np.searchsorted(at_min, min(5.0, at_min[-1] / 4)))
-    told = [
-        Told(name, c, PATH, walk.positions, at_min, path_integration(senses[c]))
+    results = [
+        MethodResult(name, c, PATH, walk.positions, at_min, path_integration(senses[c]))
         for c in (FULL, WEAK)
     ]
-    diaries, walls = {}, None
+    logs: dict[str, PlaceCellLog] = {}
+    walls: Wall | None = None
     for method, conditions in ((SLRB, tuple(senses)), (HEBB, (FULL, WEAK))):
         some = stacked([senses[c] for c in conditions])
-        diary = Diary(np.isfinite(some.wall_m[..., 0]), walk.positions[0], early)
-        config = BrainConfig(wall_memory={} if method == SLRB else NO_WALLS)
-        lived = live_with(some, config, diary)
-        diaries[method] = diary
+        log = PlaceCellLog(np.isfinite(some.wall_m[..., 0]), walk.positions[0], early)
+        config = BrainConfig() if method == SLRB else BrainConfig(wall_memory=NO_WALLS)
+        cells = run_cells(some, config, log)
+        logs[method] = log
         if method == SLRB:
-            walls = lived.walls.remembered()[0]
+            walls = cells.walls.remembered()[0]
         for number, condition in enumerate(conditions):
             rows = slice(number * k, (number + 1) * k)
-            own = [
+            estimate, winner = (
                 x[:, rows].transpose(1, 0, 2) + walk.positions[0]
-                for x in (diary.estimate, diary.winner)
-            ]
-            counts = Spread(at_min[diary.count_steps], np.array(diary.counted).T[rows])
-            more = diary.single(rows) | {"lost_share": float(diary.lost[:, rows].mean())}
-            told.append(Told(name, condition, method, walk.positions, at_min, *own, counts, more))
-    way = pose_cells_alone(stacked([senses[FULL], senses[WEAK]]))
+                for x in (log.estimate, log.winner)
+            )
+            counts = Spread(at_min[log.count_steps], np.array(log.counted).T[rows])
+            more = log.single(rows) | {"lost_share": float(log.lost[:, rows].mean())}
+            results.append(
+                MethodResult(
+                    name, condition, method, walk.positions, at_min, estimate, winner, counts, more
+                )
+            )
+    path = pose_cells_alone(stacked([senses[FULL], senses[WEAK]]))
     for number, condition in enumerate((FULL, WEAK)):
         rows = slice(number * k, (number + 1) * k)
-        own = PoseCellWay(way.steps, way.cells[rows], way.turned_rad[rows])
-        told.append(_told_by_pose_cells(name, condition, walk, own))
-    first = PoseCellWay(way.steps, way.cells[:1], way.turned_rad[:1])
+        own = PoseCellPath(path.steps, path.cells[rows], path.turned_rad[rows])
+        results.append(_pose_cell_result(name, condition, walk, own))
+    first = PoseCellPath(path.steps, path.cells[:1], path.turned_rad[:1])
     pose_maps = [_pose_map(first, walk, stop) for stop in (early, math.inf)]
-    return TrackResult(name, walk, told, diaries, walls, pose_maps, float(at_min[early]))
+    assert walls is not None  # SLRB has run
+    return TrackResult(name, walk, results, logs, walls, pose_maps, float(at_min[early]))
 
 
-def _told_by_pose_cells(name: str, condition: str, walk: Walk, way: PoseCellWay) -> Told:
-    steps = way.steps
+def _pose_cell_result(name: str, condition: str, walk: Walk, path: PoseCellPath) -> MethodResult:
+    steps = path.steps
     at_min = (walk.times_s[steps] - walk.times_s[0]) / 60.0
-    nearest = np.round(way.cells).astype(int)
+    nearest = np.round(path.cells).astype(int)
     firsts = [visited(one[:, :2])[1] for one in nearest]
     ends = np.append(np.arange(0, len(steps) - 1, _COUNT_EVERY // _POSE_STEPS), len(steps) - 1)
     counts = np.array([np.searchsorted(first, ends, side="right") for first in firsts])
     nearest[..., 2] %= PoseCellConfig().n_theta
     with_heading = np.mean([len(visited(one)[1]) for one in nearest])
-    in_m = (way.in_world(cells) + walk.positions[0] for cells in (way.cells, nearest))
-    return Told(
-        name, condition, RATSLAM, walk.positions[steps], at_min, *in_m,
+    estimate, winner = (path.in_world(cells) + walk.positions[0] for cells in (path.cells, nearest))
+    return MethodResult(
+        name, condition, RATSLAM, walk.positions[steps], at_min, estimate, winner,
         Spread(at_min[ends], counts), {"cells_with_heading": float(with_heading)},
     )  # fmt: skip
 
 
-def _pose_map(first: PoseCellWay, walk: Walk, stop: float) -> tuple[np.ndarray, np.ndarray]:
+def _pose_map(first: PoseCellPath, walk: Walk, stop: float) -> tuple[np.ndarray, np.ndarray]:
     until = first.steps <= stop
     cells, _, numbers = visited(np.round(first.cells[0, until, :2]).astype(int))
     return first.in_world(cells[None])[0] + walk.positions[0], links_of(numbers)
