@@ -142,7 +142,7 @@ def test_a_fleet_on_one_map_is_exit_0_and_one_that_is_not_3(tmp_path, call):
     # The places that must agree go into the config, as for `run`.
     strict = call("fleet", *given, "-o", tmp_path / "one", "--overwrite", "--confirm", "900")
     assert strict.code == 3
-    assert "900 must (--confirm)" in strict.out
+    assert "expected 900 (--confirm)" in strict.out
     assert not (tmp_path / "one" / "merged").exists()
 
 
@@ -165,7 +165,7 @@ def test_a_failed_session_is_reported_in_one_line_and_stops_no_other(tmp_path, c
 def test_mistakes_are_one_line_and_nothing_is_lost(done, tmp_path, mistake):
     out, _ = done
     before = digest(out / "merged")
-    assert "a fleet has 2 sources or more, got 1" in mistake("fleet", RING, "-o", tmp_path / "a")
+    assert "got 1 source; expected at least 2" in mistake("fleet", RING, "-o", tmp_path / "a")
     assert "holds a fleet.json already" in mistake("fleet", *SOURCES, "-o", out)
     wrong = ["--set", "view.treshold=1", "--overwrite"]
     assert "view.treshold" in mistake("fleet", *SOURCES, "-o", out, *wrong)

@@ -217,7 +217,7 @@ def test_a_merge_can_be_merged_inspected_and_drawn(runs, merged, tmp_path, call)
     for k, maps in enumerate([(runs / "b", out), (out, runs / "b")]):
         again = tmp_path / str(k)
         done = call("merge", *maps, "-o", again)
-        assert (done.code, "nothing is new" in done.out) == (0, maps[0] == out)
+        assert (done.code, "no experience is new" in done.out) == (0, maps[0] == out)
         assert call("verify", again).code == 0
         found, expected = (load_brain(f / "brain.safetensors") for f in (again, merged))
         assert sizes(found) == sizes(expected)
@@ -231,7 +231,7 @@ def test_a_merge_is_the_same_every_time(runs, merged, tmp_path, call):
 def test_a_map_merged_with_itself_is_that_map(runs, tmp_path, call):
     done = call("merge", runs / "a", runs / "a", "-o", tmp_path / "out")
     assert done.code == 0
-    assert "nothing is new" in done.out
+    assert "no experience is new" in done.out
     a, out = (load_brain(f / "brain.safetensors") for f in (runs / "a", tmp_path / "out"))
     assert sizes(out) == sizes(a)
 
@@ -244,7 +244,7 @@ def test_maps_that_do_not_meet_are_refused_with_the_reason_and_nothing_is_writte
 ):
     done = call("merge", runs / "a", runs / "elsewhere", "-o", tmp_path / "out")
     assert (done.code, done.err) == (3, "")
-    assert re.match(r"not merged: .*look.*\n", done.out)
+    assert re.match(r"not merged: no view of one map matches one of the other.*\n", done.out)
     assert "Written" not in done.out
     assert list(tmp_path.iterdir()) == []
 
@@ -277,7 +277,7 @@ def test_confirm_says_how_many_places_must_agree(runs, tmp_path, call):
     out = tmp_path / "out"
     refused = call("merge", runs / "a", runs / "b", "-o", out, "--confirm", "1000")
     assert refused.code == 3
-    assert "1000 must (--confirm)" in refused.out
+    assert "expected 1000 (--confirm)" in refused.out
     assert not out.exists()
     assert call("merge", runs / "a", runs / "b", "-o", out, "--confirm", "20").code == 0
     assert load_brain(out / "brain.safetensors").config.sessions.confirm == 20

@@ -350,7 +350,7 @@ def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_p
     assert main(["run", "camera:0", "-o", str(out), "--stop", "5", "--no-tensorboard", *small]) == 0
     page = write_report(out).read_text()
     assert "a live source cannot be read again" in page
-    with pytest.raises(RunError, match="camera:0: is live; tuning looks several times"):
+    with pytest.raises(RunError, match="camera:0: is live; tuning reads its source several times"):
         tune("camera:0", tmp_path / "tuned")
 
 
