@@ -43,7 +43,7 @@ NOT_COMPARED = ("sessions.text", "clock.after_gap_s")
 cells of a brain that does not use them."""
 
 ROUNDING = 1e-5
-"""Metres and parts of a turn: a path of some metres in single precision, 2e-7 m a step, added up."""
+"""Metres, parts of a turn: a path of some metres in single precision, 2e-7 m a step, added up."""
 
 
 def arithmetic() -> str:
