@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuroslam.cells.convolve import Kernels, Packet, circulant, trim, widen
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI
+from neuroslam.geometry import TWO_PI, rotate_points
 from neuroslam.types import PoseEstimate
 
 Headings = list[list[float]]
@@ -222,10 +222,7 @@ def moved_cells(
     if paths is not None:
         apart = cells[:, :2] - pivot[:2]
         apart = apart + n[:2] * np.round((paths - apart) / n[:2])
-        angle = TWO_PI * shift[2] / n[2]
-        c, s = math.cos(angle), math.sin(angle)
-        x, y = apart.T
-        turned = np.column_stack([c * x - s * y, s * x + c * y])
+        turned = rotate_points(apart, TWO_PI * shift[2] / n[2])
         moved[:, :2] = pivot[:2] + shift[:2] + turned
     moved = moved % n
     return np.where(moved >= n, 0.0, moved)  # a tiny negative rounds up to n

@@ -14,7 +14,7 @@ from neuroslam.cells.grid import lahn_drive
 from neuroslam.cells.oscillators import turn_phases, wave_vectors
 from neuroslam.cells.place import EMPTY, FAR_M, NEIGHBOURS
 from neuroslam.errors import listed
-from neuroslam.geometry import TWO_PI, wrap_angle
+from neuroslam.geometry import TWO_PI, rotation_matrix, wrap_angle
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
@@ -44,8 +44,7 @@ class Frames(NamedTuple):
             >>> frames.place(torch.tensor([[2.0, 0.0]])).tolist()
             [[5.0, 6.0]]
         """
-        c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        turn = points_m.new_tensor([[c, -s], [s, c]])
+        turn = points_m.new_tensor(rotation_matrix(self.turn_rad))
         start = points_m.new_tensor(self.pivot[:2])
         return (points_m - start) @ turn.mT + points_m.new_tensor(self.onto[:2])
 
@@ -237,9 +236,8 @@ def _join_walls(loaded: State, partial: State, frames: Frames) -> State:
     merged["walls.n_walls"] = torch.tensor([n + len(kept)])
     active = partial["walls.active"]
     merged["walls.active"] = torch.where(active >= 0, to[active.clamp_min(0)], -1)
-    c, s = math.cos(frames.turn_rad), math.sin(frames.turn_rad)
     turn = torch.eye(partial["walls.covariance"].shape[-1], dtype=torch.float64)
-    turn[:2, :2] = torch.tensor([[c, -s], [s, c]])
+    turn[:2, :2] = torch.from_numpy(rotation_matrix(frames.turn_rad))
     merged["walls.covariance"] = turn @ partial["walls.covariance"] @ turn.mT
     merged["walls.moved_m"] = partial["walls.moved_m"] @ turn[:2, :2].mT
     return merged

@@ -4,7 +4,7 @@ import numpy as np
 
 from neuroslam.cells.attractor import moved_cells
 from neuroslam.config import BrainConfig
-from neuroslam.geometry import TWO_PI
+from neuroslam.geometry import TWO_PI, rotate_points
 from neuroslam.state.join import MovedCells
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State
@@ -35,9 +35,7 @@ def move_session(loaded: State, partial: State, match: Match, config: BrainConfi
     paths = view_paths = None
     if config.sessions.cells == "turn":
         angle = TWO_PI * pivot[2] / cells.n_theta - poses[match.partial, 2]
-        c, s = np.cos(angle), np.sin(angle)
-        dx, dy = ((poses - poses[match.partial])[:, :2] / cells.cell_size_m).T
-        paths = np.column_stack([c * dx - s * dy, s * dx + c * dy])
+        paths = rotate_points((poses - poses[match.partial])[:, :2] / cells.cell_size_m, angle)
         first = np.full(len(bound), match.partial)
         first[views[::-1]] = np.arange(len(views))[::-1]  # the first experience with each view
         view_paths = paths[first]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
-from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, rotation_matrix, wrap_angle, wrap_angles
 from neuroslam.state.match import Match, Pairs
 from neuroslam.types import Pose
 
@@ -33,8 +33,7 @@ class Outline(NamedTuple):
 
     def moved(self, turn_rad: float, move_m: np.ndarray) -> "Outline":
         """Turn about the origin, then move."""
-        c, s = math.cos(turn_rad), math.sin(turn_rad)
-        turn = np.array([[c, -s], [s, c]])
+        turn = rotation_matrix(turn_rad)
         return Outline(self.feet_m @ turn.T + move_m, wrap_angles(self.bearing_rad + turn_rad))
 
 
@@ -148,9 +147,7 @@ def _refine(
         system = np.column_stack([normals, lever])
         prior = np.diag([1e-6, 1e-6, 1.0])
         step = np.linalg.solve(system.T @ system + prior, -system.T @ across)
-        c, s = math.cos(step[2]), math.sin(step[2])
-        turning = np.array([[c, -s], [s, c]])
-        move = turning @ (move - centre) + centre + step[:2]
+        move = rotation_matrix(step[2]) @ (move - centre) + centre + step[:2]
         turn = wrap_angle(turn + float(step[2]))
         n_same = int((np.abs(across) < off_m).sum())
         same = np.abs(across) < off_m

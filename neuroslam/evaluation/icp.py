@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import Alignment, align
+from neuroslam.geometry import rotation_matrix
 
 IcpMode = Literal["rigid", "similarity"]
 
@@ -195,8 +196,7 @@ def _turned_starts(source: np.ndarray, target: np.ndarray, scale: float) -> list
     first = _principal_angle(target) - _principal_angle(source)
     starts = []
     for angle in first + np.arange(_N_ROTATIONS) * (2.0 * math.pi / _N_ROTATIONS):
-        c, s = math.cos(angle), math.sin(angle)
-        rotation = np.array([[c, -s], [s, c]])
+        rotation = rotation_matrix(angle)
         shift = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
         starts.append(Alignment(rotation, shift, scale))
     return starts

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from neuroslam.errors import MapError, SourceError
-from neuroslam.geometry import wrap_angles
+from neuroslam.geometry import relative_poses
 from neuroslam.state.files import write_atomically
 
 AlignmentMode = Literal["none", "rigid", "similarity"]
@@ -169,8 +169,8 @@ def relative_pose_error(
             f"relative error: delta is {delta} frames, expected 1 to {len(estimate) - 1} "
             f"for {len(estimate)} poses"
         )
-    estimated, true = (_relative(poses[:-delta], poses[delta:]) for poses in (estimate, truth))
-    error = _relative(true, estimated)
+    estimated, true = (relative_poses(poses[:-delta], poses[delta:]) for poses in (estimate, truth))
+    error = relative_poses(true, estimated)
     return RelativePoseError(
         _statistics(np.hypot(error[:, 0], error[:, 1])), _statistics(np.abs(error[:, 2]))
     )
@@ -320,12 +320,6 @@ def _as_points(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
             at = int(np.argmin(np.isfinite(points).all(axis=1)))
             raise MapError(f"trajectories: point {at} of the {name} is not finite")
     return estimate, truth
-
-
-def _relative(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
-    dx, dy, turn = (second - first).T
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap_angles(turn)])
 
 
 def _nearest(of: np.ndarray, among: np.ndarray) -> np.ndarray:

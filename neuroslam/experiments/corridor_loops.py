@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from neuroslam.errors import SourceError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error, align
 from neuroslam.figures.style import LOOP, MAP, ODOMETRY, OTHER, TRUTH, save
-from neuroslam.geometry import integrate_velocities, wrap_angles
+from neuroslam.geometry import integrate_velocities, rotate_points, wrap_angles
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.state.files import write_atomically
@@ -183,8 +183,7 @@ def track_at_truth(corridor: Corridor, graph: Graph, poses: np.ndarray) -> np.nd
     own = np.searchsorted(graph.frames, np.arange(len(corridor.times_s)), side="right") - 1
     turn = (poses[:, 2] - graph.poses[:, 2])[own]
     offset = corridor.odometry[:, :2] - graph.poses[own, :2]
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    track = poses[own, :2] + cos * offset + sin * np.column_stack([-offset[:, 1], offset[:, 0]])
+    track = poses[own, :2] + rotate_points(offset, turn)
     return np.column_stack(
         [np.interp(corridor.truth_s, corridor.times_s, axis) for axis in track.T]
     )

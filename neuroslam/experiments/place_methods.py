@@ -17,7 +17,7 @@ from neuroslam.config import BrainConfig, PoseCellConfig, WallMemoryConfig
 from neuroslam.evaluation.ratemap import responding
 from neuroslam.experiments.animals import WALLS, path_integration, read_track, run_cells
 from neuroslam.figures.place_errors import Spread
-from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.geometry import TWO_PI, rotate_points, wrap_angles
 from neuroslam.types import Motion
 from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import SenseNoise, Senses, sense
@@ -149,9 +149,7 @@ class PoseCellPath(NamedTuple):
 
     def in_world(self, cells: np.ndarray) -> np.ndarray:
         """Return x and y of such a path in metres from the start, ``(batch, n, 2)``."""
-        cos, sin = np.cos(self.turned_rad)[:, None], np.sin(self.turned_rad)[:, None]
-        x, y = _POSE_CELL_M * cells[..., 0], _POSE_CELL_M * cells[..., 1]
-        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        return rotate_points(_POSE_CELL_M * cells, self.turned_rad[:, None])
 
 
 def pose_cells_alone(senses: Senses) -> PoseCellPath:

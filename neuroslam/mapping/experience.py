@@ -8,7 +8,7 @@ import torch
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.graph import ExperienceGraph
 from neuroslam.mapping.least_squares import solve_pose_graph
@@ -304,6 +304,5 @@ class ExperienceMap(ExperienceGraph):
     def _turn_offset(self, by_rad: float) -> None:
         """Keep the robot's pose relative to its experience when the experience turns."""
         s = self.state
-        c, si = math.cos(by_rad), math.sin(by_rad)
-        s.dx_m, s.dy_m = c * s.dx_m - si * s.dy_m, si * s.dx_m + c * s.dy_m
+        s.dx_m, s.dy_m = rotate(s.dx_m, s.dy_m, by_rad)
         s.facing_rad = wrap_angle(s.facing_rad + by_rad)

@@ -8,7 +8,7 @@ import torch
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import wrap_angle
+from neuroslam.geometry import rotate, wrap_angle
 from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.planning import Plan, quickest_path, shortest_path_lengths
 from neuroslam.mapping.tables import (
@@ -146,12 +146,8 @@ class ExperienceGraph(Mergeable):
         heading = 0.0
         if s.current != NO_EXPERIENCE:
             heading = self.experiences["pose"][s.current, 2].item()
-        c, si = math.cos(heading), math.sin(heading)
-        return Pose(
-            c * s.dx_m + si * s.dy_m,
-            -si * s.dx_m + c * s.dy_m,
-            wrap_angle(s.facing_rad - heading),
-        )
+        dx, dy = rotate(s.dx_m, s.dy_m, -heading)
+        return Pose(dx, dy, wrap_angle(s.facing_rad - heading))
 
     def neighbours(self, experience: int) -> list[int]:
         """Return the experiences linked with this one in either direction, sorted.

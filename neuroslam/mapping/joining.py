@@ -1,11 +1,9 @@
 """Merge of two maps: partial experiences moved, their links rerouted, ids renamed."""
 
-import math
-
 import numpy as np
 import torch
 
-from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.tables import ALIAS_COLUMNS, Links, origin_key
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State, renamed
@@ -48,14 +46,9 @@ def merge_maps(loaded: State, partial: State, join: Join) -> State:
     merged |= {name: tensor for name, tensor in partial.items() if name.startswith("goals.")}
     merged["goals.experience"] = torch.from_numpy(ids[old["goals.experience"]])
     merged["state.current"] = renamed(partial["state.current"], ids)
-    c, s = math.cos(join.rotation_rad), math.sin(join.rotation_rad)
-    dx, dy = old["state.dx_m"].item(), old["state.dy_m"].item()
+    dx, dy = rotate(old["state.dx_m"].item(), old["state.dy_m"].item(), join.rotation_rad)
     facing = wrap_angle(old["state.facing_rad"].item() + join.rotation_rad)
-    for name, value in (
-        ("dx_m", c * dx - s * dy),
-        ("dy_m", s * dx + c * dy),
-        ("facing_rad", facing),
-    ):
+    for name, value in (("dx_m", dx), ("dy_m", dy), ("facing_rad", facing)):
         merged[f"state.{name}"] = torch.tensor(value, dtype=torch.float64)
     merged["state.at_rest"] = torch.tensor(0)
     return merged

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from neuroslam.geometry import wrap_angles
+from neuroslam.geometry import rotate_points, wrap_angles
 from neuroslam.state.match import Pairs
 
 
@@ -115,6 +115,4 @@ def n_places(pairs: Pairs) -> int:
 
 
 def _seen_from(here: np.ndarray, heading_rad: np.ndarray, there: np.ndarray) -> np.ndarray:
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    dx, dy = (there - here)[:, :2].T
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx])
+    return rotate_points((there - here)[:, :2], -heading_rad)

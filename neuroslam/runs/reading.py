@@ -12,7 +12,7 @@ import numpy as np
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, counted
-from neuroslam.geometry import integrate_velocities, wrap_angles
+from neuroslam.geometry import compose_poses, integrate_velocities
 from neuroslam.mapping.tables import origin_key
 from neuroslam.runs.files import (
     FRAME_COLUMNS,
@@ -96,10 +96,7 @@ def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarr
     at[:, 2] += turn_rad
     if not brain.sessions.merges:
         at[trace["number"] < 0] = 0.0  # before the first experience
-    c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
-    x = at[:, 0] + c * trace["dx_m"] - s * trace["dy_m"]
-    y = at[:, 1] + s * trace["dx_m"] + c * trace["dy_m"]
-    return np.column_stack([x, y, wrap_angles(at[:, 2] + trace["dtheta_rad"])])
+    return compose_poses(at, np.column_stack([trace[n] for n in ("dx_m", "dy_m", "dtheta_rad")]))
 
 
 def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndarray:

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
+from neuroslam.geometry import rotate_points, rotation_matrix
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED
 from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
@@ -18,19 +19,12 @@ def into_frame(pose: np.ndarray, point_m: np.ndarray) -> np.ndarray:
         >>> into_frame(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0])).round(6).tolist()
         [2.0, 0.0]
     """
-    return rotated(point_m - pose[:2], -pose[2])
+    return rotate_points(point_m - pose[:2], -pose[2])
 
 
 def from_frame(poses: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     """Invert :func:`into_frame` for ``(n, 3)`` poses and ``(n, 2)`` points."""
-    return poses[:, :2] + rotated(points_m, poses[:, 2])
-
-
-def rotated(points_m: np.ndarray, by_rad: np.ndarray | float) -> np.ndarray:
-    """Rotate points about the origin, ``(..., 2)``."""
-    c, s = np.cos(by_rad), np.sin(by_rad)
-    x, y = points_m[..., 0], points_m[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    return poses[:, :2] + rotate_points(points_m, poses[:, 2])
 
 
 def shared_frames(
@@ -83,6 +77,5 @@ def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:
 
 def _alignment(start_m: np.ndarray, onto_m: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     turn = _turn_between(start_m, onto_m)
-    c, s = math.cos(turn), math.sin(turn)
-    rotation = np.array([[c, s], [-s, c]])
-    return lambda points: (points - start_m.mean(0)) @ rotation + onto_m.mean(0)
+    rotation = rotation_matrix(turn)
+    return lambda points: (points - start_m.mean(0)) @ rotation.T + onto_m.mean(0)

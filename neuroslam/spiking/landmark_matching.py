@@ -1,11 +1,9 @@
 """Alignment of two maps whose experiences are landmarks, by those that both know by name."""
 
-import math
-
 import numpy as np
 
 from neuroslam.config import BrainConfig
-from neuroslam.geometry import wrap_angles
+from neuroslam.geometry import move_points, wrap_angles
 from neuroslam.spiking.landmark_frames import shared_frames
 from neuroslam.spiking.sightings import NAMED
 from neuroslam.state.match import Match, Pairs
@@ -43,14 +41,8 @@ def match_landmarks(
             f"them, and most, must agree within {same_m:g} m on the alignment of the maps"
         )
     start, onto = frames
-    c, s = math.cos(onto.theta_rad), math.sin(onto.theta_rad)
-    turn = np.array([[c, s], [-s, c]])
-
-    def moved(points_m: np.ndarray) -> np.ndarray:
-        return (points_m - np.array(start[:2])) @ turn + np.array(onto[:2])
-
     theirs, ours = (np.array([table[key][1] for key in both]) for table in places)
-    away = np.linalg.norm(moved(ours) - theirs, axis=1)
+    away = np.linalg.norm(move_points(ours, start, onto) - theirs, axis=1)
     same = away <= same_m
     ids = np.array([(places[1][key][0], places[0][key][0]) for key in both])[same]
     headings = maps[1][ids[:, 0], 2] + onto.theta_rad
@@ -58,7 +50,7 @@ def match_landmarks(
     pairs = Pairs(ids[:, 0], ids[:, 1], turns, away[same])
     best = int(np.argmin(pairs.error))
     z = int(pairs.partial[best])
-    x, y = moved(maps[1][z : z + 1, :2])[0].tolist()
+    x, y = move_points(maps[1][z, :2], start, onto).tolist()
     match = Match(
         int(pairs.loaded[best]),
         z,

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from neuroslam.config.semantic import SemanticConfig
-from neuroslam.geometry import wrap_angle
-from neuroslam.spiking.landmark_frames import rotated
+from neuroslam.geometry import rotate_points, wrap_angle
 from neuroslam.spiking.sightings import NAMELESS, VIEW
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, landmark_pointer
@@ -75,7 +74,7 @@ def merge_landmarks(
         if theirs["experience"] >= 0:
             theirs["experience"] = int(join.experiences[theirs["experience"]])
             turn = float(join.turns_rad[other.known["experience"][row]])
-            theirs["offset_m"] = rotated(np.array(theirs["offset_m"]), turn).tolist()
+            theirs["offset_m"] = rotate_points(np.array(theirs["offset_m"]), turn).tolist()
         if at is None:
             keys[kind, number] = len(columns["kind"])
             for c, value in (theirs | {"number": number, "place_m": there[row].tolist()}).items():

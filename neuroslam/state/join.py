@@ -4,7 +4,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from neuroslam.geometry import wrap_angle, wrap_angles
+from neuroslam.geometry import move_points, wrap_angle, wrap_angles
 from neuroslam.types import Pose
 
 
@@ -99,7 +99,7 @@ class Join(NamedTuple):
             [[5.0, 6.0, 1.570796327]]
         """
         turned = wrap_angles(poses[:, 2] - self.pivot.theta_rad + self.onto.theta_rad)
-        return np.column_stack([_moved(poses[:, :2], self.pivot, self.onto), turned])
+        return np.column_stack([move_points(poses[:, :2], self.pivot, self.onto), turned])
 
     @property
     def cells_turn_rad(self) -> float:
@@ -109,12 +109,4 @@ class Join(NamedTuple):
 
     def place_cells(self, points_m: np.ndarray) -> np.ndarray:
         """Move positions that partial cells keep, ``(n, 2)``, into the loaded cells' frame."""
-        return _moved(points_m, *(self.cells or (self.pivot, self.onto)))
-
-
-def _moved(points_m: np.ndarray, pivot: Pose, onto: Pose) -> np.ndarray:
-    """Turn points about a pose and move them, so that it comes to lie onto another."""
-    turn = onto.theta_rad - pivot.theta_rad
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = points_m[:, 0] - pivot.x_m, points_m[:, 1] - pivot.y_m
-    return np.column_stack([c * dx - s * dy + onto.x_m, s * dx + c * dy + onto.y_m])
+        return move_points(points_m, *(self.cells or (self.pivot, self.onto)))
