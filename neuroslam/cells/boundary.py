@@ -203,7 +203,8 @@ def checked_walls(walls: object) -> np.ndarray:
         neuroslam.errors.BadFrame: walls are an array of text of shape (1,); expected ...
     """
     array = checked_array(walls, "walls", (None, 2), "distance in m and bearing in rad of each")
-    check_walls(*torch.from_numpy(np.ascontiguousarray(array)).unbind(-1))
+    if not ((array[:, 0] >= 0.0).all() and np.isfinite(array[:, 1]).all()):  # NaN too
+        check_walls(*torch.from_numpy(np.ascontiguousarray(array)).unbind(-1))
     return array
 
 
