@@ -12,6 +12,7 @@ from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.config import BrainConfig
+from neuroslam.config.populations import HOMES
 from neuroslam.errors import ConfigError, counted
 from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
@@ -22,6 +23,7 @@ from neuroslam.merging.match import shared_history
 from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
 from neuroslam.state.population import Population
@@ -112,6 +114,8 @@ class BrainState(nn.Module):
         self.recognition = Recognition()
         self.continuity = Continuity(config)
         self._changed()
+        if set(self._populations) - HOMES.keys():  # those of the package have names of their own
+            check_names(self._populations.values())
 
     def _loaded(self) -> None:
         """Go on from a whole state."""

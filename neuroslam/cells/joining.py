@@ -53,7 +53,7 @@ def join_navigation(loaded: State, partial: State, join: Join) -> State:
     """Merge the states of navigation cells; neither is altered.
 
     Place cells nearer to each other than ``threshold_m`` become one, and their visits add; if each
-    is an experience of the map, those become one whose experiences do. Stretches of wall that both
+    is an experience of the map, those become one whose experiences do. Wall segments that both
     remember become one. The partial session's position and phases move.
 
     Args:

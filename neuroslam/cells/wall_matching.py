@@ -73,7 +73,7 @@ def align_outlines(
         loaded: Outline that stays; not empty.
         partial: Outline that moves; not empty.
         turns_rad: Rotations to try.
-        reach_m: Extent of a stretch of wall.
+        reach_m: Extent of a wall segment.
         off_m: Largest distance between two walls that match.
     """
     tree = cKDTree(loaded.feet_m)
@@ -179,7 +179,7 @@ def match_walls(
     needed = max(_LEAST_WALLS, math.ceil(_LEAST_SHARE * min(counts)))
     if min(counts) < _LEAST_WALLS:
         return None, (
-            f"the maps remember {counts[0]} and {counts[1]} stretches of wall; both need "
+            f"the maps remember {counts[0]} and {counts[1]} wall segments; both need "
             f"{_LEAST_WALLS} to be aligned"
         )
     memory = config.wall_memory
@@ -187,7 +187,7 @@ def match_walls(
     off_m = _OFF_SIGMAS * memory.sigma_m
     best = align_outlines(*outlines, turns, memory.spread_m, off_m)
     aligned = (
-        f"{best.n_same} of {counts[1]} stretches of wall align with the other map's, "
+        f"{best.n_same} of {counts[1]} wall segments align with the other map's, "
         f"residual {best.off_m:.3f} m"
     )
     if best.n_same < needed:

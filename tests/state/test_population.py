@@ -3,9 +3,14 @@
 import base64
 import copy
 import csv
+import importlib.util
+import json
 import math
+import os
+import subprocess
 import sys
 import textwrap
+from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -418,6 +423,44 @@ def test_processes_of_a_sweep_load_the_file_and_its_seed_is_varied_too(plugin, t
     assert [row["draws"] for row in rows(tmp_path / "out" / "sweep.csv")] == [
         "15", "1015", "30", "1030"
     ]  # fmt: skip
+
+
+RAY = """
+import json, os, sys
+import ray
+ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="error")
+from neuroslam.config.populations import load_plugin
+from neuroslam.runs.sweep import sweep
+load_plugin(sys.argv[1])
+rows = sweep([sys.argv[2]], sys.argv[3], vary=["draws.step=1,2"], stop=5, ray="local",
+             assignments=["cells=pose+draws"])
+print(json.dumps([[row["error"], row.get("draws")] for row in rows]))
+"""
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="Ray is not installed: neuroslam[sweep]"
+)
+def test_workers_of_a_ray_cluster_that_ran_before_load_the_file(plugin, tmp_path):
+    here = {k: v for k, v in os.environ.items() if k != populations.PLUGINS}
+    done = subprocess.run(
+        [sys.executable, "-c", RAY, str(plugin), WORLD, str(tmp_path / "out")],
+        capture_output=True, text=True, check=False,
+        env=here | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [["", 5], ["", 10]]
+
+
+def test_run_and_sweep_print_what_the_population_counts(plugin, call, tmp_path):
+    options = ("--set", "cells=pose+draws", "--stop", 5, "--plugin", plugin)
+    done = call("run", WORLD, *options, "--no-tensorboard", "--out", tmp_path / "run")
+    assert "\ndraws 5\n" in done.out
+    done = call("sweep", WORLD, *options, "--vary", "draws.step=1,2", "--out", tmp_path / "sweep")
+    table = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines()]
+    assert [row[-1] for row in table if row] == ["5", "10"] or [
+        row[-2] for row in table if row
+    ] == ["5", "10"]
 
 
 def test_without_its_file_a_run_and_a_brain_say_how_to_give_it(plugin, call, mistake, tmp_path):
