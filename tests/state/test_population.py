@@ -3,10 +3,9 @@
 import base64
 import copy
 import csv
-import importlib.util
-import json
 import math
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -425,31 +424,29 @@ def test_processes_of_a_sweep_load_the_file_and_its_seed_is_varied_too(plugin, t
     ]  # fmt: skip
 
 
-RAY = """
-import json, os, sys
-import ray
-ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="error")
-from neuroslam.config.populations import load_plugin
-from neuroslam.runs.sweep import sweep
-load_plugin(sys.argv[1])
-rows = sweep([sys.argv[2]], sys.argv[3], vary=["draws.step=1,2"], stop=5, ray="local",
-             assignments=["cells=pose+draws"])
-print(json.dumps([[row["error"], row.get("draws")] for row in rows]))
+WORKER = """
+import sys
+from neuroslam.runs.parallel import _attempt_on_ray
+print(_attempt_on_ray(sys.argv[1], bytes.fromhex(sys.argv[2])))
 """
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None, reason="Ray is not installed: neuroslam[sweep]"
-)
-def test_workers_of_a_ray_cluster_that_ran_before_load_the_file(plugin, tmp_path):
+def test_a_worker_of_ray_loads_the_file_before_it_reads_a_config(plugin, tmp_path):
+    """It is started by the cluster: it has nothing of this process's environment."""
+    populations.load_plugin(plugin)
+    call = pickle.dumps((str, BrainConfig(cells="pose+draws", draws={"step": 7}).section("draws")))
     here = {k: v for k, v in os.environ.items() if k != populations.PLUGINS}
-    done = subprocess.run(
-        [sys.executable, "-c", RAY, str(plugin), WORLD, str(tmp_path / "out")],
-        capture_output=True, text=True, check=False,
-        env=here | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [["", 5], ["", 10]]
+    said = {}
+    for file in (plugin, tmp_path / "nowhere.py"):
+        done = subprocess.run(
+            [sys.executable, "-c", WORKER, str(file), call.hex()],
+            capture_output=True, text=True, check=False,
+            env=here | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        said[file.name] = done.stdout.strip()
+    assert said["draws.py"] == "seed=0 step=7"
+    assert "nowhere.py: no such file; expected a Python file" in said["nowhere.py"]
 
 
 def test_run_and_sweep_print_what_the_population_counts(plugin, call, tmp_path):
