@@ -206,15 +206,13 @@ def _on_ray(
         _connect(ray, address, jobs)
     running: dict[Any, int] = {}
     try:
-        from ray import cloudpickle
-
         task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt_on_ray)
         plugins = os.environ.get(PLUGINS, "")
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
                 number, item = waiting.popleft()
-                running[task.remote(plugins, cloudpickle.dumps((function, item)))] = number
+                running[task.remote(plugins, pickle.dumps((function, item)))] = number
             (done,), _ = ray.wait(list(running), num_returns=1)
             number = running.pop(done)
             try:
