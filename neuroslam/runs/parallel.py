@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import cv2
 import torch
 
-from neuroslam.config.populations import PLUGINS
+from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
 
 T = TypeVar("T")
@@ -237,6 +237,7 @@ def _attempt_on_ray(plugins: str, call: bytes) -> object:
     """
     os.environ[PLUGINS] = plugins
     try:
+        known_kinds()  # loads the plugins: the item can hold a class of one
         function, item = pickle.loads(call)
     except NeuroslamError as error:  # a plugin is not on this machine
         return error
