@@ -193,7 +193,7 @@ feet = np.column_stack([wall.x_m + wall.distance_m * wall.bearing_rad.cos(),
 figure, axes = plt.subplots(figsize=(5.4, 5.6), layout="constrained")
 axes.plot(*centres[links].transpose(2, 1, 0), color=MAP, lw=0.6, alpha=0.6)
 axes.plot(*centres.T, ".", color=MAP, ms=4, label=f"{len(centres)} place cells")
-axes.plot(*feet.T, "s", color=LOOP, ms=4, label=f"{len(feet)} stretches of wall")
+axes.plot(*feet.T, "s", color=LOOP, ms=4, label=f"{len(feet)} wall segments")
 axes.plot(*centres[path].T, color=ROBOT, lw=3, label="planned path")
 draw_arena(axes, arena)
 axes.set_title("Place cells, links, walls, and a planned path")
@@ -254,7 +254,7 @@ plt.show()
 # ## Two sessions, one map
 # A second animal in the same arena starts elsewhere, with other noise. The two maps are aligned by their walls.
 #
-# **What to see:** the report counts the matched stretches of wall; the merged map is one pentagon of place
+# **What to see:** the report counts the matched wall segments; the merged map is one pentagon of place
 # cells, not two shifted ones.
 
 # %%

@@ -15,7 +15,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import brain_file
-from neuroslam.state.answers import counts_of
+from neuroslam.state.answers import counts_of, gathered
 from neuroslam.state.sessions import Session
 
 
@@ -75,16 +75,15 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
     ]
-    for population in brain.populations.values():
-        rows += [_count(name, value) for name, value in counts_of(population).items()]
-    return rows
+    counts = gathered(brain.populations.values(), counts_of)
+    return rows + [shown_count(name, value) for name, value in counts.items()]
 
 
-def _count(name: str, value: float) -> tuple[str, str]:
+def shown_count(name: str, value: float) -> tuple[str, str]:
     """Format a count; a suffix of its name can be its unit.
 
     Example:
-        >>> _count("place_cells", 3), _count("lost_s", 1.25)
+        >>> shown_count("place_cells", 3), shown_count("lost_s", 1.25)
         (('place cells', '3'), ('lost', '1.2 s'))
     """
     if name.endswith(("_s", "_m", "_hz")):
