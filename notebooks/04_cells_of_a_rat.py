@@ -172,6 +172,7 @@ print("d rates / d Q:", tuple(grid.feedforward.grad.shape))
 # **What to see:** place cells of the first animal and their links fill the arena; squares are the feet of
 # remembered walls and lie on its outline; the orange path was planned from corner to corner.
 
+
 # %%
 def explore(seed, minutes):
     brain = NavigationBrain(build_config(read_preset("slrb")))
