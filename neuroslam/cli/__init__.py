@@ -23,6 +23,7 @@ from neuroslam.cli.results import (
     evaluate_command,
     export_command,
     inspect_command,
+    plan_command,
     plot_command,
     report_command,
     verify_command,
@@ -81,6 +82,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "export": export_command,
     "demo": demo_command,
     "evaluate": evaluate_command,
+    "plan": plan_command,
     "plot": plot_command,
     "report": report_command,
     "presets": presets_command,
@@ -89,7 +91,9 @@ _COMMANDS: dict[str, Callable[..., int]] = {
 """In the order in which ``--help`` lists them."""
 
 for _name, _command in _COMMANDS.items():
-    app.command(_name)(with_plugins(_command))
+    # A position such as -1,2 is no option.
+    negative = {"ignore_unknown_options": _name == "plan"}
+    app.command(_name, context_settings=negative)(with_plugins(_command))
 
 
 @contextmanager

@@ -62,15 +62,67 @@ def export_command(
     return 0
 
 
+def plan_command(
+    path: MapFile,
+    goal: Annotated[
+        str, typer.Argument(metavar="GOAL", help="Id of an experience, or X,Y in metres.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of plan.csv and plan.png; default: the run's."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(help="Experience or X,Y to start from; default: where the robot is."),
+    ] = None,
+) -> int:
+    """Plan the quickest path to an experience or a position of a map."""
+    from neuroslam.runs.plan import plan
+
+    found = plan(path, goal, out, start)
+    beside = f", {found.beside_m:.2f} m from {goal}" if found.beside_m else ""
+    say(
+        f"From experience {found.path[0]} to {found.path[-1]}{beside}: "
+        f"{counted(len(found.path) - 1, 'link')}, {found.length_m:.2f} m, {found.duration_s:.1f} s"
+    )
+    say(f"Written: {', '.join(str(file) for file in found.files)}")
+    return 0
+
+
 def evaluate_command(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
     truth: Annotated[
         Path | None, typer.Option(help="Ground truth as a TUM file; a run of a world has its own.")
     ] = None,
     align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
+    against: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="Compare the map with that of another run, by ICP."),
+    ] = None,
+    to: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="With --against: figure; default: TRACK/against.png."),
+    ] = None,
 ) -> int:
-    """Compare a trajectory with the ground truth."""
-    from neuroslam.runs.evaluate import evaluate
+    """Compare a trajectory with the ground truth, or a map with that of another run."""
+    from neuroslam.runs.evaluate import compare_maps, evaluate
+
+    if against is not None:
+        table = Table(title=f"Experiences of {track} aligned with those of {against} by ICP")
+        for column in ("alignment", "RMSE (m)", "of the diagonal (%)", "rotation (°)", "scale"):
+            table.add_column(column, justify="left" if column == "alignment" else "right")
+        rows, figure = compare_maps(track, against, to)
+        for row in rows:
+            table.add_row(
+                row.mode,
+                f"{row.rmse_m:.4f}",
+                f"{100.0 * row.of_diagonal:.3g}",
+                f"{row.turn_deg:.1f}",
+                f"{row.scale:.4f}",
+            )
+        say(table)
+        say(f"Written: {figure}")
+        return 0
 
     table = Table(title=f"{track} and ground truth, {align} alignment")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):

@@ -46,6 +46,7 @@ def plot_map(
     session: np.ndarray | None = None,
     session_names: Sequence[str] = (),
     odometry_of: str = "",
+    planned: np.ndarray | None = None,
     title: str | None = None,
 ) -> Figure:
     """Draw the experience map, beside dead reckoning by its odometry.
@@ -67,6 +68,7 @@ def plot_map(
         session: Number of the session that made each experience, ``(n,)``, from 0: its colour.
         session_names: Names of the sessions, for the legend; colours repeat after six.
         odometry_of: Name of the session of the odometry, for the legend.
+        planned: Positions of a planned path, ``(p, 2)``.
         title: Title of the whole figure.
 
     Raises:
@@ -80,7 +82,7 @@ def plot_map(
             draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of)
         draw_map(
             axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks, session,
-            session_names,
+            session_names, planned,
         )  # fmt: skip
     return figure
 

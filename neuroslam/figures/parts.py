@@ -89,8 +89,9 @@ def draw_map(
     landmarks: np.ndarray | None = None,
     session: np.ndarray | None = None,
     names: Sequence[str] = (),
+    planned: np.ndarray | None = None,
 ) -> None:
-    """Draw experiences, links, loop closures, landmarks, the robot, and the aligned truth."""
+    """Draw experiences, links, loop closures, landmarks, the robot, a path, and the truth."""
     poses, links = np.asarray(poses).reshape(-1, 3), np.asarray(links, np.int64).reshape(-1, 2)
     xy, is_loop = poses[:, :2], closes_loop(links[:, 0], links[:, 1])
     counts = ((len(xy), "experience"), (len(links), "link"), (int(is_loop.sum()), "loop closure"))
@@ -115,6 +116,10 @@ def draw_map(
     if len(spots):
         style: dict[str, Any] = {"ls": "none", "marker": "*", "ms": 10, "mfc": LANDMARK}
         axes.plot(*spots.T, zorder=6, label="landmarks", mec=INK, mew=0.5, **style)
+    if planned is not None:
+        course = np.asarray(planned)
+        axes.plot(*course.T, color=OTHER, lw=4.0, alpha=0.8, zorder=5, label="planned path")
+        axes.plot(*course[-1], "D", color=OTHER, ms=8, mec=INK, mew=0.8, zorder=8, label="goal")
     _draw_ends(axes, xy, end=current is None)
     if current is not None:
         draw_robot(axes, current, "robot now")

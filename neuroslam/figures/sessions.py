@@ -184,8 +184,9 @@ def plot_overlay(
     title: str | None = None,
     reference_links: np.ndarray | None = None,
     aligned_links: np.ndarray | None = None,
+    names: tuple[str, str] = ("single session", "merged map, aligned"),
 ) -> Figure:
-    """Draw a merged map, aligned, over the map of a single session.
+    """Draw a map, aligned, over another: a merged map over that of a single session.
 
     Args:
         reference_xy: Experiences of the single session ``(n, 2)``, in metres: purple.
@@ -195,6 +196,7 @@ def plot_overlay(
         title: Title; the error stands below it.
         reference_links: Source and target of each link ``(m, 2)``; without: points only.
         aligned_links: The same for the merged map.
+        names: Names of both for the legend.
     """
     maps = [np.asarray(xy, np.float64).reshape(-1, 2) for xy in (reference_xy, aligned_xy)]
     looks: tuple[dict[str, Any], ...] = (
@@ -219,7 +221,6 @@ def plot_overlay(
         set_window(axes, box, window)
         error = f"RMSE {metres(rmse_m)} ({100.0 * fraction:.3g} % of the diagonal)"
         write_titles(axes, title or "Merged map over the single session", error)
-        names = ("single session", "merged map, aligned")
         pairs = zip(names, looks, strict=True)
         key = [Line2D([], [], label=name, **look) for name, look in pairs]
         return finish(figure, key, window)

@@ -1,10 +1,15 @@
-"""Errors of a run's trajectory against the ground truth."""
+"""Errors of a run's trajectory against the ground truth, and of its map against another map."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
+import numpy as np
+
+from neuroslam.brain import load_brain
 from neuroslam.errors import RunError, counted
+from neuroslam.evaluation.icp import IcpMode, fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.trajectory import (
     AlignmentMode,
     ErrorStatistics,
@@ -13,6 +18,9 @@ from neuroslam.evaluation.trajectory import (
     read_tum,
     relative_pose_error,
 )
+from neuroslam.figures.sessions import plot_overlay
+from neuroslam.figures.style import save
+from neuroslam.runs.files import brain_file
 from neuroslam.runs.reading import read_trace, track_file, true_poses
 
 
@@ -76,3 +84,73 @@ def evaluate(
         ("relative, per frame", relative.translation_m, "m"),
         ("relative, per frame", relative.rotation_rad, "rad"),
     ]
+
+
+class MapComparison(NamedTuple):
+    """Result of the alignment of one map with another.
+
+    Attributes:
+        mode: ``rigid``, or ``similarity`` with a free scale.
+        rmse_m: RMSE between the experiences of the map and the nearest of the other, m.
+        of_diagonal: The same as a share of the diagonal of the other map.
+        turn_deg: Rotation of the map onto the other, degrees.
+        scale: Scale of the map onto the other.
+    """
+
+    mode: IcpMode
+    rmse_m: float
+    of_diagonal: float
+    turn_deg: float
+    scale: float
+
+
+def compare_maps(
+    run: str | Path, other: str | Path, to: str | Path | None = None
+) -> tuple[list[MapComparison], Path]:
+    """Compare the map of a run with that of another, as the multisession paper does (ICP, RMSE).
+
+    Args:
+        run: Folder of a run, or a brain file.
+        other: The same, of the map to compare with.
+        to: Figure of both maps, rigidly aligned; ``against.png`` beside the first if not given.
+
+    Returns:
+        The comparison with a rigid alignment and with a similarity, and the figure.
+
+    Raises:
+        NeuroslamError: If a brain cannot be read, or a map has too few experiences.
+    """
+    files = brain_file(run), brain_file(other)
+    maps = [load_brain(file).map for file in files]
+    ours, theirs = (each.poses[:, :2] for each in maps)
+    rows = []
+    modes: tuple[IcpMode, ...] = ("rigid", "similarity")
+    for mode in modes:
+        found = map_rmse(ours, theirs, mode)
+        (c, _), (s, _) = found.alignment.rotation
+        rows.append(
+            MapComparison(
+                mode,
+                found.rmse,
+                fraction_of_diagonal(found.rmse, theirs),
+                math.degrees(math.atan2(s, c)),
+                found.alignment.scale,
+            )
+        )
+        if mode == "rigid":
+            names = tuple(str(Path(each)) for each in (other, run))
+            figure = plot_overlay(
+                theirs,
+                found.alignment.apply(ours),
+                found.rmse,
+                rows[0].of_diagonal,
+                "Two maps, aligned by ICP",
+                *(np.column_stack([m.links.source, m.links.target]) for m in reversed(maps)),
+                names=(names[0], f"{names[1]}, aligned"),
+            )
+    path = Path(to) if to is not None else files[0].parent / "against.png"
+    try:
+        save(figure, path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written ({error.strerror or error})") from None
+    return rows, path
