@@ -45,12 +45,50 @@ _CLASSIC_REGIONS = {
     "vrot_image": ("odometry", "turn_region"),
 }
 
+# What OpenRatSLAM takes where its file has no such key.
+_CLASSIC_DEFAULTS: dict[str, dict[str, float]] = {
+    "ratslam": {
+        "vt_shift_match": 25,
+        "vt_step_match": 5,
+        "vt_normalisation": 0.0,
+        "vt_patch_normalise": 0,
+        "vt_min_patch_normalisation_std": 0.0,
+        "vt_panoramic": 0,
+        "vt_match_threshold": 0.03,
+        "vt_active_decay": 1.0,
+        "pc_dim_xy": 21,
+        "pc_dim_th": 36,
+        "pc_w_e_dim": 7,
+        "pc_w_i_dim": 5,
+        "pc_w_e_var": 1,
+        "pc_w_i_var": 2,
+        "pc_global_inhib": 0.00002,
+        "pc_vt_inject_energy": 0.15,
+        "pc_vt_restore": 0.05,
+        "pc_cell_x_size": 1.0,
+        "exp_delta_pc_threshold": 2.0,
+        "exp_correction": 0.5,
+        "exp_loops": 10,
+        "exp_initial_em_deg": 90.0,
+    },
+    "visual_odometry": {
+        "camera_fov_deg": 50.0,
+        "camera_hz": 10.0,
+        "vtrans_scaling": 100.0,
+        "vtrans_max": 20.0,
+    },
+}
+_EDGES = {"x_min": 0, "x_max": -1, "y_min": 0, "y_max": -1}  # those of the image
+
 # Keys that mean nothing without ROS: names of topics, paths of media.
 _CLASSIC_IGNORED = {"topic_root", "media_path", "image_file", "enable", "odom_map", "calibrate"}
 
 
 def from_classic(text: str, path: Path) -> dict[str, Any]:
     """Read the text of an OpenRatSLAM ``.ini``/``.txt`` as nested keys and values, by our names.
+
+    Keys that a section does not have take OpenRatSLAM's own defaults, and edges of a region that
+    are left out are those of the image. A file without ``[visual_odometry]`` says nothing of it.
 
     Args:
         text: Content of the file.
@@ -71,6 +109,8 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
     values: dict[str, Any] = {}
     regions: dict[str, dict[str, int]] = {}
     for section in parser.sections():
+        for key, default in _CLASSIC_DEFAULTS.get(section, {}).items():
+            parser[section].setdefault(key, str(default))
         for key, raw in parser[section].items():
             prefix = key.removesuffix("_x_min").removesuffix("_x_max")
             prefix = prefix.removesuffix("_y_min").removesuffix("_y_max")
@@ -96,14 +136,7 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
                 )
     for prefix, edges in regions.items():
         where, name = _CLASSIC_REGIONS[prefix]
-        missing = [e for e in ("x_min", "x_max", "y_min", "y_max") if e not in edges]
-        if missing:
-            raise ConfigError(
-                f"config {path}: {prefix}_{missing[0]} is missing; a region needs all four edges"
-            )
-        values.setdefault(where, {})[name] = tuple(
-            edges[e] for e in ("x_min", "x_max", "y_min", "y_max")
-        )
+        values.setdefault(where, {})[name] = tuple((_EDGES | edges).values())
     cells = values.get("pose_cells", {})
     for kernel in ("excite", "inhibit"):  # the classic file has one width for position and heading
         if f"{kernel}_std_xy" in cells:

@@ -9,7 +9,19 @@ from neuroslam.config.section import Section
 from neuroslam.errors import did_you_mean
 
 Region = tuple[int, int, int, int]
-"""Part of an image: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded."""
+"""Part of an image: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded; -1 as a maximum is
+the edge of the image."""
+
+
+def region_in(region: Region, height: int, width: int) -> Region:
+    """Return a region with the edges of an image in place of maxima of -1.
+
+    Example:
+        >>> region_in((10, -1, 0, 50), height=120, width=160)
+        (10, 160, 0, 50)
+    """
+    x_min, x_max, y_min, y_max = region
+    return x_min, width if x_max == -1 else x_max, y_min, height if y_max == -1 else y_max
 
 
 class OdometryConfig(Section):
@@ -23,12 +35,12 @@ class OdometryConfig(Section):
     speed_region: Region | None = Field(
         default=None,
         description="region of the image that measures speed, x_min, x_max, y_min, y_max in px; "
-        "none: the lower half",
+        "-1 as a maximum: the edge of the image; none: the lower half",
     )
     turn_region: Region | None = Field(
         default=None,
         description="region of the image that measures the turn rate, x_min, x_max, y_min, y_max "
-        "in px; none: the upper half",
+        "in px, -1 as a maximum: the edge of the image; none: the upper half",
     )
     max_shift_px: int = Field(
         default=40,
@@ -78,8 +90,8 @@ class ViewConfig(Section):
     )
     crop: Region | None = Field(
         default=None,
-        description="region of the image that is used, x_min, x_max, y_min, y_max in px; none: the "
-        "whole image",
+        description="region of the image that is used, x_min, x_max, y_min, y_max in px, -1 as a "
+        "maximum: the edge of the image; none: the whole image",
     )
     template_width: int = Field(
         default=60,

@@ -102,7 +102,8 @@ def _draw_templates(axes: Axes, tuning: Tuning) -> None:
     seen: dict[str, float] = {}
     for score in tuning.views:
         config = score.config
-        rows = "all rows" if config.crop is None else f"rows {config.crop[2]} to {config.crop[3]}"
+        top, end = (0, -1) if config.crop is None else config.crop[2:]
+        rows = f"rows {top} to {end}" if end >= 0 else f"rows from {top}" if top else "all rows"
         patch = f", patch {config.patch_radius}" if config.patch_radius else ""
         of = "" if config.features == "grey" else f"{config.features}\n"
         label = f"{of}{config.template_width} x {config.template_height}, {rows}{patch}"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.config.sections import OdometryConfig, Region
+from neuroslam.config.sections import OdometryConfig, Region, region_in
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.sensors.frames import check_image
 from neuroslam.state.mergeable import AboutNow
@@ -237,7 +237,7 @@ def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region,
         "turn_region": (0, width, 0, height // 2),
     }
     for name, half in halves.items():
-        region = getattr(config, name) or half
+        region = region_in(getattr(config, name) or half, height, width)
         x_min, x_max, y_min, y_max = region
         if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
             raise ConfigError(

@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from neuroslam.config import BrainConfig, to_toml
-from neuroslam.config.sections import ViewConfig
+from neuroslam.config.sections import ViewConfig, region_in
 from neuroslam.errors import RunError, counted
 from neuroslam.figures.style import save
 from neuroslam.figures.tuning import plot_tuning
@@ -289,7 +289,7 @@ def _usable(
     configs = [current]
     for option in options:
         config = current.model_copy(update=option)
-        x_min, x_max, y_min, y_max = config.crop or (0, shape[1], 0, shape[0])
+        x_min, x_max, y_min, y_max = region_in(config.crop or (0, -1, 0, -1), *shape[:2])
         fits = config.template_width <= x_max - x_min and config.template_height <= y_max - y_min
         if fits and config not in configs and 2 * config.shift_match < config.template_width:
             configs.append(config)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from neuroslam.config import ViewConfig
+from neuroslam.config.sections import region_in
 from neuroslam.errors import ConfigError
 from neuroslam.sensors.frames import check_image
 
@@ -55,15 +56,15 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
 
 
 def crop(image: np.ndarray, region: tuple[int, int, int, int] | None) -> np.ndarray:
-    """Crop an image to ``x_min, x_max, y_min, y_max``; ``None`` keeps all of it.
+    """Crop an image to ``x_min, x_max, y_min, y_max``, -1: its edge; ``None`` keeps all of it.
 
     Raises:
         ConfigError: If the region exceeds the image.
     """
     if region is None:
         return image
-    x_min, x_max, y_min, y_max = region
     height, width = image.shape[:2]
+    x_min, x_max, y_min, y_max = region_in(region, height, width)
     if not (0 <= x_min < x_max <= width and 0 <= y_min < y_max <= height):
         raise ConfigError(
             f"view.crop = {list(region)} (x_min, x_max, y_min, y_max) is not inside the image "

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from neuroslam.brain import NavigationBrain
 from neuroslam.cells import NavigationCells
 from neuroslam.config import (
     CLASSIC_NAMES,
@@ -298,7 +299,115 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
         "[general]\ntopic_root=irat_red\n[ratslam]\nvt_match_threshold=0.04 # a comment\n"
         "pc_dim_th=36\n[draw]\nenable=1\n"
     )
-    assert read_config_file(path) == {"view": {"threshold": 0.04}, "pose_cells": {"n_theta": 36}}
+    values = read_config_file(path)
+    assert values.keys() == {"view", "pose_cells", "map"}  # nothing of visual odometry
+    assert (values["view"]["threshold"], values["pose_cells"]["n_theta"]) == (0.04, 36)
+
+
+# The keys of the files published with OpenRatSLAM, typed from them.
+PUBLISHED = {
+    "irat": """
+[general]
+topic_root=irat_red
+[ratslam]
+image_crop_y_max=150
+template_x_size=60
+template_y_size=20
+vt_shift_match = 4
+vt_step_match = 1
+vt_match_threshold = 0.03
+vt_active_decay = 1.0
+pc_dim_xy = 11
+pc_vt_inject_energy = 0.1
+pc_cell_x_size = 0.015
+exp_delta_pc_threshold = 2
+exp_loops=20
+exp_initial_em_deg=140
+[draw]
+enable=1
+media_path=../src/media
+image_file=irat_sm.tga
+""",
+    "new_college": """
+[general]
+topic_root=/newcollege/
+[ratslam]
+vt_match_threshold = 0.054
+template_x_size=60
+template_y_size=10
+vt_panoramic=1
+vt_patch_normalise=2
+pc_cell_x_size = 1.0
+pc_dim_xy = 30
+exp_delta_pc_threshold = 2.0
+pc_vt_inject_energy = 0.2
+vt_active_decay = 1.0
+exp_loops=100
+""",
+    "st_lucia": """
+[ratslam]
+image_crop_x_min=40
+image_crop_x_max=600
+image_crop_y_min=120
+image_crop_y_max=280
+vt_match_threshold = 0.048
+template_x_size=280
+template_y_size=1
+vt_shift_match = 11
+vt_step_match = 5
+vt_normalisation = 1
+pc_vt_restore=0.04
+pc_cell_x_size = 2
+pc_dim_xy = 30
+exp_delta_pc_threshold = 1.0
+pc_vt_inject_energy = 0.10
+vt_active_decay = 1.0
+exp_loops=20
+[visual_odometry]
+vtrans_image_x_min=195
+vtrans_image_x_max=475
+vtrans_image_y_min=270
+vtrans_image_y_max=430
+vrot_image_x_min=195
+vrot_image_x_max=475
+vrot_image_y_min=75
+vrot_image_y_max=240
+camera_fov_deg=53
+camera_hz = 10
+vtrans_scaling = 1000
+vtrans_max=20
+""",
+}
+
+
+def published(name, folder):
+    (folder / f"{name}.txt").write_text(PUBLISHED[name])
+    return resolve_config("openratslam", folder / f"{name}.txt")
+
+
+def test_the_published_files_of_openratslam_load_as_they_are(tmp_path):
+    irat, college, lucia = (published(name, tmp_path) for name in PUBLISHED)
+    assert irat.view.crop == (0, -1, 0, 150)
+    assert (irat.view.normalisation, irat.view.shift_match, irat.view.shift_step) == (0.0, 4, 1)
+    assert (irat.pose_cells.restore, irat.map.correction) == (0.05, 0.5)
+    assert (college.view.shift_match, college.view.shift_step) == (25, 5)
+    assert (college.view.panoramic, college.view.patch_radius, college.view.crop) == (True, 2, None)
+    assert (college.map.loops, college.map.initial_heading_deg) == (100, 90.0)
+    assert (lucia.view.template_height, lucia.view.normalisation) == (1, 1.0)
+    assert (lucia.odometry.fov_deg, lucia.frame_rate_hz) == (53.0, 10.0)
+
+
+@pytest.mark.parametrize(("name", "world"), [
+    ("irat", "corridor?width=416&height=240"),
+    ("new_college", "campus?width=240&height=60"),
+    ("st_lucia", "town?width=640&height=480&odometry=false"),
+])  # fmt: skip
+def test_a_brain_drives_with_a_published_file(name, world, tmp_path):
+    brain = NavigationBrain(published(name, tmp_path))
+    for frame in open_source(f"world:{world}&noise=0.02").frames(0, 25):
+        brain(frame)
+    assert brain.view.n > 0
+    assert brain.map.n > 0
 
 
 @pytest.mark.parametrize(
@@ -312,7 +421,6 @@ def test_a_classic_file_may_have_comments_and_topics(tmp_path):
         ),
         ("a.ini", "[ratslam]\nvt_match_threshold=x\n", "expected a number"),
         ("a.ini", "no section\n", "not an OpenRatSLAM file"),
-        ("a.ini", "[ratslam]\nimage_crop_x_min=1\n", "image_crop_x_max is missing"),
         ("a.toml", "view = [", "not valid TOML"),
         ("a.toml", b"\xff\xfe\x00", "cannot be read as text"),
     ],
