@@ -291,8 +291,9 @@ class SemanticCells(Population):
         }
 
     def tables(self) -> dict[str, str]:
-        """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience. With
-        words there is a last column ``words``.
+        """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience.
+
+        A vocabulary with words adds the column ``words``.
         """
         known = self.landmarks()
         columns = ("name", "place_m", "seen", "first_frame", "experience", "words")
@@ -327,7 +328,8 @@ class SemanticCells(Population):
         kinds = state.get("words.kind", np.empty(0, dtype=np.int64))
         rows = np.flatnonzero((kinds < 0) | (kinds >= len(KINDS)))
         if len(rows):
-            yield f"words {listed(rows)}: kind {listed(kinds[rows])}, expected 0 to {len(KINDS) - 1}"
+            most = len(KINDS) - 1
+            yield f"words {listed(rows)}: kind {listed(kinds[rows])}, expected 0 to {most}"
 
     @without_gradients
     def advance(

@@ -19,7 +19,6 @@ from neuroslam.sensors.landmarks import (
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMED, NAMELESS, VIEW
 from neuroslam.state.tables import GrowingTable, Scalars
 
-
 _KINDS = ("landmark", "view", "nameless")
 
 
