@@ -96,22 +96,33 @@ def _label(axes: Axes, everything: Sequence[Found], found: set[str], size_m: np.
     for one in ordered:
         if len(everything) > _LABELLED and one.name not in found:
             continue
-        at = np.array(one.position_m) / size_m
+        at = np.array(_middle(one)) / size_m
         width = 0.016 * len(one.name)
         if any(abs(at[0] - p[0]) < width and abs(at[1] - p[1]) < 0.045 for p in written):
             continue
         written.append(at)
         axes.annotate(
             one.name.replace("_", " ").lower(),
-            one.position_m,
+            _middle(one),
             (0, -9 if one.kind == "landmark" else 0),
             textcoords="offset points",
             ha="center",
             va="top" if one.kind == "landmark" else "center",
             fontsize=7,
             color=INK if one.name in found else "#777777",
+            bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
             zorder=8,
         )
+
+
+def _middle(one: Found) -> tuple[float, float]:
+    """Return where the name is written: of a wall, the middle of its longest part."""
+    if one.kind != "wall":
+        return one.position_m
+    corners = np.array(one.corners_m)
+    longest = int(np.hypot(*np.diff(corners, axis=0).T).argmax())
+    x, y = corners[longest : longest + 2].mean(0).tolist()
+    return x, y
 
 
 def _draw_question(axes: Axes, form: str, numbers: Sequence[float]) -> None:

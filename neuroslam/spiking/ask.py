@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from neuroslam.errors import SourceError, SpaceError, did_you_mean
-from neuroslam.sensors.landmarks import Kind, products
+from neuroslam.sensors.landmarks import KINDS, Kind, products
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.extents import area_share, distance_to, length_share
 from neuroslam.spiking.semantic import SemanticCells
@@ -86,7 +86,8 @@ class Answer(NamedTuple):
 
     Attributes:
         question: What was asked.
-        found: What answers it: the nearest first, or in the order of the map.
+        found: What answers it: landmarks, then walls, then regions; at a position the nearest
+            of each first, else in the order of the map.
         note: One line on what was not found; empty for none.
         everything: All that the map knows, to draw it.
     """
@@ -281,8 +282,8 @@ def _at(
     ]
     apart.sort(key=lambda one: one.distance_m)
     found = [one for one in apart if one.distance_m <= within_m]
-    if found:
-        return found, ""
+    if found:  # landmarks first: those at the corners of a region are more than the region
+        return sorted(found, key=lambda one: KINDS.index(one.kind)), ""
     note = f"nothing is within {within_m:g} m of {at[0]:g},{at[1]:g}"
     if apart:
         x, y = apart[0].position_m
