@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from neuroslam import cli
 from neuroslam.config.semantic import SemanticConfig, SSPSLAMConfig
 from neuroslam.errors import SpaceError
-from neuroslam.experiments.semantic_maps import STAGES, Trial, score
+from neuroslam.experiments.semantic_maps import CELLS, STAGES, Trial, score
 from neuroslam.runs.ask import AskedMap
 from neuroslam.sensors.landmarks import LandmarkWords
 from neuroslam.spiking import SSPSLAM, queries, save_semantic_map
@@ -270,7 +270,7 @@ def test_a_semantic_map_file_is_asked_too(tmp_path):
 
 
 def test_the_answers_of_a_map_are_right_after_save_resume_and_merge():
-    scores = score(Trial(3, "semantic"))
+    scores = score(Trial(2, CELLS[0]))
     assert tuple(scores) == STAGES
     for stage, counts in scores.items():
         assert counts["named"] == counts["landmarks"] >= 6, stage
