@@ -30,8 +30,9 @@ def plot_answer(answer: Answer, positions_m: np.ndarray, links: np.ndarray) -> F
     with mpl.rc_context(STYLE):
         low, high = _extent(answer, positions_m)
         size = high - low
-        width = min(max(6.4 * float(size[0] / size[1]), 5.2), 10.0)
-        figure = new_figure(width, min(max(width * float(size[1] / size[0]), 3.4), 9.0) + 1.1, None)
+        scale = min(9.0 / float(size[0]), 7.0 / float(size[1]))  # inches a metre
+        width, height = np.maximum(scale * size, (3.2, 1.6)).tolist()
+        figure = new_figure(width + 0.8, height + 1.2, None)  # room for labels, title, legend
         axes = figure.subplots()
         if len(links):
             lines = LineCollection([*positions_m[links]], colors=ODOMETRY, lw=0.8, zorder=1)
