@@ -55,6 +55,7 @@ def semantic_maps(
     _data_folder: Path | None,
     out_folder: Path,
     maps: int = 100,
+    first_seed: int = 100,
     jobs: int | None = None,
     ray: str | None = None,
 ) -> dict[str, Any]:
@@ -71,7 +72,8 @@ def semantic_maps(
     Args:
         _data_folder: Not used.
         out_folder: ``results.json`` is written there.
-        maps: Number of maps; world, posts, cells and noise follow from their number.
+        maps: Number of maps; world, posts, cells and noise follow from their seeds.
+        first_seed: Seed of the first; the others follow.
         jobs: As for :func:`neuroslam.runs.parallel.parallel_map`: maps in parallel.
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
 
@@ -79,7 +81,7 @@ def semantic_maps(
         The content of ``results.json``: ``rows``, one for each stage, and ``each``, with the
         counts of every map.
     """
-    trials = [Trial(seed, CELLS[seed % 2]) for seed in range(maps)]
+    trials = [Trial(seed, CELLS[seed % 2]) for seed in range(first_seed, first_seed + maps)]
     each = parallel_map(score, trials, jobs, ray)
     rows = [
         _row(stage, [scores[stage] for scores in each if stage in scores], len(each))

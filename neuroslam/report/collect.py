@@ -225,7 +225,7 @@ def _words(brain: NavigationBrain) -> dict[str, Any]:
     cells = brain.populations.get("semantic")
     if not isinstance(cells, SemanticCells) or not cells.words.entries:
         return {}
-    return {"words": [one.to_dict() for one in contents(cells)[0]]}
+    return {"words": [one.to_dict() for one in contents(cells).found]}
 
 
 def _pose_cells(cells: PoseCellNetwork) -> dict[str, np.ndarray]:

@@ -23,7 +23,8 @@ EXAMPLES = (
     "which landmarks are blue",
     "the whole map",
 )
-_LEAST_STRENGTH = 0.4  # of a recall, below which a landmark is not known
+_LEAST_STRENGTH = 0.1  # of a recall, below which a landmark is not known
+_CLEAR = 0.7  # similarity of a recall with the position decoded from it, as a share of its strength
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _COMMA = r"\s*[,\s]\s*"
 _FORMS = (
@@ -106,6 +107,20 @@ class Answer(NamedTuple):
         }
 
 
+class Contents(NamedTuple):
+    """All that a semantic map knows.
+
+    Attributes:
+        found: Landmarks, walls and regions with their recalled positions.
+        missing: Name in capitals -> why what has this name is not among them.
+        words: All words in capitals, also of what is not among them.
+    """
+
+    found: tuple[Found, ...]
+    missing: dict[str, str]
+    words: frozenset[str]
+
+
 def parse_question(text: str) -> Question:
     """Parse a question.
 
@@ -150,9 +165,9 @@ def ask(
     """Answer a question from the memory of a semantic map.
 
     Every position is recalled: the pointer of a landmark is the key, and the vector that the memory
-    returns is decoded. Names and attributes select the pointers. Walls and regions have their
-    corners at recalled landmarks. Views and landmarks that were seen only once or twice are left
-    out.
+    returns is decoded, if it is like that of one position. Names and attributes select the
+    pointers. Walls and regions have their corners at recalled landmarks. Views and landmarks that
+    were seen only once or twice are left out.
 
     Args:
         semantic_map: Semantic cells of a brain, or a map of its own in the plane.
@@ -178,7 +193,8 @@ def ask(
         [('DOOR', 2.0)]
     """
     asked = parse_question(question) if isinstance(question, str) else question
-    everything, missing = contents(semantic_map)
+    known = contents(semantic_map)
+    everything = known.found
     if within_m is None:
         within_m = (
             semantic_map.config.same_m
@@ -196,18 +212,15 @@ def ask(
             found = everything
             note = "" if found else "the map knows no landmarks"
         case _:
-            found, note = _described(everything, missing, asked)
+            found, note = _described(known, asked)
     return Answer(asked, tuple(found), note, everything)
 
 
-def contents(semantic_map: SemanticCells | SSPSLAM) -> tuple[tuple[Found, ...], dict[str, str]]:
-    """Return all that a map knows, and why what it has words of is not known.
+def contents(semantic_map: SemanticCells | SSPSLAM) -> Contents:
+    """Recall all that a map knows.
 
     Args:
         semantic_map: As for :func:`ask`.
-
-    Returns:
-        Landmarks, walls and regions with their recalled positions; and name -> reason.
     """
     cells = semantic_map if isinstance(semantic_map, SemanticCells) else None
     slam = semantic_map.slam if isinstance(semantic_map, SemanticCells) else semantic_map
@@ -218,7 +231,8 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> tuple[tuple[Found, ...], 
     with torch.inference_mode():
         z = slam.space.to_fourier(slam.map.read(slam.pointers)[0])
         strength = z.abs().square().mean(-1).sqrt().tolist()
-        at = PositionDecoder(slam.space)(z).position_m.tolist()
+        decoded = PositionDecoder(slam.space)(z)
+        at, clear = decoded.position_m.tolist(), decoded.similarity.tolist()
     rows = range(len(slam.names)) if cells is None else _confirmed(cells)
     found: list[Found] = []
     by_number: dict[int, Found] = {}
@@ -228,7 +242,7 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> tuple[tuple[Found, ...], 
         if cells is not None:
             kind, number = (int(cells.known[c][row]) for c in ("kind", "number"))
             words = cells.words.words_of(kind, number)
-        if strength[row] < _LEAST_STRENGTH:
+        if strength[row] < _LEAST_STRENGTH or clear[row] < _CLEAR * strength[row]:
             missing[name.upper()] = f"{name} is not recalled clearly, strength {strength[row]:.2f}"
             continue
         x, y = at[row]
@@ -260,7 +274,10 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> tuple[tuple[Found, ...], 
                     strength=min(c.strength for c in corners),
                 )
             )
-    return tuple(found), missing
+    entries = () if cells is None else cells.words.entries
+    every = [products(entry.words) for entry in entries if entry.words]
+    words = frozenset(word for each in every for product in each for word in product)
+    return Contents(tuple(found), missing, words)
 
 
 def _confirmed(cells: SemanticCells) -> list[int]:
@@ -308,34 +325,27 @@ def _share_in(one: Found, low_m: np.ndarray, high_m: np.ndarray) -> float:
     return share(np.array(one.corners_m), low_m, high_m)
 
 
-def _described(
-    everything: Sequence[Found], missing: dict[str, str], asked: Question
-) -> tuple[list[Found], str]:
+def _described(known: Contents, asked: Question) -> tuple[list[Found], str]:
     """Find what has a name or attributes."""
     text = asked.words.strip().upper()
-    named = [one for one in everything if one.name.upper() == text.replace(" ", "_")]
+    named = [one for one in known.found if one.name.upper() == text.replace(" ", "_")]
     if named:
         return named, ""
-    if reason := missing.get(text.replace(" ", "_")):
+    if reason := known.missing.get(text.replace(" ", "_")):
         return [], reason
-    words = {one.name: products(one.words) if one.words else () for one in everything}
-    known = {word for each in words.values() for product in each for word in product}
-    known |= {kind.upper() for kind in ("landmark", "wall", "region")}
+    words = set(known.words) | {kind.upper() for kind in KINDS}
     alternatives = _alternatives(text, asked.text)
-    names = [one.name.upper() for one in everything]
+    names = [one.name.upper() for one in known.found]
     for word in sorted({w for each in alternatives for product in each for w in product}):
-        if word not in known and _singular(word) not in known:
+        if word not in words and _singular(word) not in words:
             raise SpaceError(
-                f"the map knows no name or word {word}{did_you_mean(word, [*names, *known])}; "
-                f"it has the words {', '.join(sorted(known))}"
+                f"the map knows no name or word {word}{did_you_mean(word, [*names, *words])}; "
+                f"it has the words {', '.join(sorted(words))}"
             )
     found = [
         one
-        for one in everything
-        if any(
-            all(_has(one, words[one.name], product, known) for product in each)
-            for each in alternatives
-        )
+        for one in known.found
+        if any(all(_has(one, product, words) for product in each) for each in alternatives)
     ]
     return found, "" if found else f"nothing on the map is {asked.words}"
 
@@ -354,11 +364,10 @@ def _alternatives(text: str, question: str) -> list[list[frozenset[str]]]:
         raise SpaceError(f"cannot read {question!r}: {error}") from None
 
 
-def _has(
-    one: Found, of_it: Sequence[frozenset[str]], product: frozenset[str], known: set[str]
-) -> bool:
-    wanted = {word if word in known else _singular(word) for word in product}
-    return any(wanted <= (mine | {one.kind.upper()}) for mine in of_it or [frozenset()])
+def _has(one: Found, product: frozenset[str], words: set[str]) -> bool:
+    wanted = {word if word in words else _singular(word) for word in product}
+    its = products(one.words) if one.words else (frozenset[str](),)
+    return any(wanted <= (each | {one.kind.upper()}) for each in its)
 
 
 def _singular(word: str) -> str:
