@@ -271,7 +271,7 @@ def test_a_semantic_map_file_is_asked_too(tmp_path):
 
 
 def test_the_answers_of_a_map_are_right_after_save_resume_and_merge():
-    scores = score(Trial(2, CELLS[0]))
+    scores = score(Trial(3, CELLS[1]))
     assert tuple(scores) == STAGES
     for stage, counts in scores.items():
         assert counts["named"] == counts["landmarks"] >= 6, stage
