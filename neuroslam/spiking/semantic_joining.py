@@ -8,7 +8,7 @@ import torch
 
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.geometry import rotate_points, wrap_angle
-from neuroslam.spiking.sightings import NAMELESS, VIEW
+from neuroslam.spiking.sightings import LEAST_SEEN, NAMELESS, VIEW
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, WordTable, landmark_pointer
 from neuroslam.state.join import Join
@@ -51,7 +51,7 @@ def merge_landmarks(
 
     Landmarks of the same name become one, views as in the merge of the maps, nameless ones by
     position. Where the positions or words differ, those of the partial session, the later one,
-    hold.
+    hold; but a landmark that was not seen often enough to be no outlier moves none that was.
 
     Args:
         make: Makes empty semantic cells like those that merge.
@@ -84,7 +84,10 @@ def merge_landmarks(
             continue
         mine = np.array(columns["place_m"][at])
         agree = np.linalg.norm(mine - there[row]) < one.config.same_m
-        columns["place_m"][at] = ((mine + there[row]) / 2 if agree else there[row]).tolist()
+        if agree:
+            columns["place_m"][at] = ((mine + there[row]) / 2).tolist()
+        elif theirs["seen"] >= LEAST_SEEN or columns["seen"][at] < LEAST_SEEN:
+            columns["place_m"][at] = there[row].tolist()
         columns["seen"][at] += theirs["seen"]
         columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
     for cells in (one, other):

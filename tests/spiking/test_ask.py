@@ -217,6 +217,18 @@ def test_a_merge_keeps_the_words_of_both_and_the_later_ones_hold():
     assert merged.slam.names == ("GATE", "LAMP", "DESK", "TREE")
 
 
+def test_an_outlier_of_a_later_session_does_not_move_a_landmark_in_a_merge():
+    one, other = taught(), SemanticCells(SemanticConfig())
+    other.advance(STILL, Sightings.of(np.array([[0.0, 5.0, math.pi]])))
+    state = merge_landmarks(
+        lambda: SemanticCells(SemanticConfig()), one.state_dict(), other.state_dict(),
+        Join.nothing(),
+    )  # fmt: skip
+    merged = SemanticCells(SemanticConfig())
+    merged.load_state_dict(state)
+    np.testing.assert_allclose(ask(merged, "where is door").found[0].position_m, (2, 0), atol=0.05)
+
+
 # --- runs --------------------------------------------------------------------------------------
 
 
