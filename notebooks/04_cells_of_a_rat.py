@@ -40,7 +40,7 @@ torch.set_num_threads(1)
 plt.rcParams.update(STYLE)
 
 arena = named_arena("pentagon")
-walk = roam(arena, 8.0, np.random.default_rng(1), speed_m_s=0.15)
+walk = roam(arena, 5.0, np.random.default_rng(1), speed_m_s=0.15)
 print(f"{walk.duration_s / 60:.0f} minutes, {len(walk.positions)} samples")
 
 # %% [markdown]
@@ -172,11 +172,18 @@ print("d rates / d Q:", tuple(grid.feedforward.grad.shape))
 # **What to see:** place cells of the first animal and their links fill the arena; squares are the feet of
 # remembered walls and lie on its outline; the orange path was planned from corner to corner.
 
+
 # %%
-brain = NavigationBrain(build_config(read_preset("slrb")))
-for frame in open_source("arena:pentagon?minutes=8&noise=1&seed=1&speed=0.15"):
-    brain(frame)
-start = np.array(next(iter(open_source("arena:pentagon?minutes=8&speed=0.15&seed=1"))).truth[:2])
+def explore(seed, minutes):
+    brain = NavigationBrain(build_config(read_preset("slrb")))
+    brain.about = (f"session {seed}", "slrb", "")
+    source = open_source(f"arena:pentagon?minutes={minutes}&noise=1&seed={seed}&speed=0.15")
+    for frame in source:
+        brain(frame)
+    return brain, np.array(next(iter(source)).truth[:2])
+
+
+brain, start = explore(seed=1, minutes=5)
 centres, links = (part.numpy() for part in brain.navigation.place.graph())
 centres = centres + start
 goal, here = int(centres[:, 1].argmax()), int(centres[:, 0].argmin())
@@ -187,7 +194,7 @@ feet = np.column_stack([wall.x_m + wall.distance_m * wall.bearing_rad.cos(),
 figure, axes = plt.subplots(figsize=(5.4, 5.6), layout="constrained")
 axes.plot(*centres[links].transpose(2, 1, 0), color=MAP, lw=0.6, alpha=0.6)
 axes.plot(*centres.T, ".", color=MAP, ms=4, label=f"{len(centres)} place cells")
-axes.plot(*feet.T, "s", color=LOOP, ms=4, label=f"{len(feet)} stretches of wall")
+axes.plot(*feet.T, "s", color=LOOP, ms=4, label=f"{len(feet)} wall segments")
 axes.plot(*centres[path].T, color=ROBOT, lw=3, label="planned path")
 draw_arena(axes, arena)
 axes.set_title("Place cells, links, walls, and a planned path")
@@ -212,33 +219,33 @@ for name, track, colour in (
     off = 100 * np.linalg.norm(track - walk.positions, axis=-1)
     axes.fill_between(minutes, off.min(0), off.max(0), color=colour, alpha=0.2, lw=0)
     axes.plot(minutes, off.mean(0), color=colour, label=name)
-axes.set(xlabel="time (min)", ylabel="position error (cm)", ylim=(0, None), xlim=(0, 8))
+axes.set(xlabel="time (min)", ylabel="position error (cm)", ylim=(0, None), xlim=(0, 5))
 axes.set_title("Error over time, four animals")
 axes.legend(loc="upper left")
 plt.show()
 
 # %% [markdown]
 # ## A kidnapped animal
-# After six minutes the animal is moved to another position. It has no camera; but it meets walls where the map
+# After 3.5 minutes the animal is moved to another position. It has no camera; but it meets walls where the map
 # has none, or misses walls of the map.
 #
 # **What to see:** doubt, the time for which walls disagree with the map, is 0 until the animal is kidnapped
 # (dashed), and grows when it meets walls then. Beyond 4 s the animal is lost, and learns nothing more.
 
 # %%
-frames = list(open_source("arena:triangle?minutes=9&noise=1&seed=1&speed=0.15"))
-lift, down = 7200, 8400
-brain = NavigationBrain(build_config(read_preset("slrb")))
+frames = list(open_source("arena:triangle?minutes=6&noise=1&seed=1&speed=0.15"))
+lift, down = 4200, 5400
+animal = NavigationBrain(build_config(read_preset("slrb")))
 doubt = []
 for i, frame in enumerate(frames[:lift] + frames[down:]):
-    result = brain(frame._replace(index=i, time_s=0.05 * i))
-    doubt.append(brain.navigation.familiarity.doubt_s.item())
+    result = animal(frame._replace(index=i, time_s=0.05 * i))
+    doubt.append(animal.navigation.familiarity.doubt_s.item())
 figure, axes = plt.subplots(figsize=(7.5, 2.6), layout="constrained")
 axes.plot(np.arange(len(doubt)) / 1200, doubt, color=LOOP)
 axes.axvline(lift / 1200, color=INK, ls="--", lw=1)
-axes.axhline(brain.config.wall_memory.lost_after_s, color=INK, lw=0.6)
+axes.axhline(animal.config.wall_memory.lost_after_s, color=INK, lw=0.6)
 axes.set(xlabel="time (min)", ylabel="doubt (s)")
-axes.set_title("Kidnapped at 6 min: " + ("lost" if result.lost else "not detected"))
+axes.set_title("Kidnapped at 3.5 min: " + ("lost" if result.lost else "not detected"))
 plt.show()
 
 # %% [markdown]
@@ -246,20 +253,14 @@ plt.show()
 # match relocalises the robot (`docs/navigation_cells.md`).
 #
 # ## Two sessions, one map
-# Two animals in one arena, with other starts and other noise. Their maps are aligned by their walls.
+# A second animal in the same arena starts elsewhere, with other noise. The two maps are aligned by their walls.
 #
-# **What to see:** the report counts the matched stretches of wall; the merged map is one pentagon of place
+# **What to see:** the report counts the matched wall segments; the merged map is one pentagon of place
 # cells, not two shifted ones.
 
 # %%
-brains = []
-for seed in (1, 2):
-    one = NavigationBrain(build_config(read_preset("slrb")))
-    one.about = (f"session {seed}", "slrb", "")
-    for frame in open_source(f"arena:pentagon?minutes=6&noise=1&seed={seed}&speed=0.15"):
-        one(frame)
-    brains.append(one)
-merged, reports = join_brains(*brains)
+other, _ = explore(seed=2, minutes=5)
+merged, reports = join_brains(brain, other)
 print("\n".join(reports[0].lines()))
 links = merged.map.links
 plot_map(merged.map.poses, np.column_stack([links.source, links.target]))

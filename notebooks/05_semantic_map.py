@@ -133,7 +133,7 @@ noisy = {"tier": "algebraic", "time_step_s": 0.01}
 alone = PathIntegratorConfig(phase_noise_rad=0.3, coupling="none")
 coupled = PathIntegratorConfig(phase_noise_rad=0.3)
 ten = random_world(10, seed=1)
-walk = band_limited_path(120.0, 0.08, seed=3, time_step_s=0.01)
+walk = band_limited_path(60.0, 0.08, seed=3, time_step_s=0.01)
 drift = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=alone), ten), [walk])
 kept = integrate(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [walk])
 closed = simulate(slam_in(SSPSLAMConfig(**noisy, integrator=coupled), ten), [ten], [walk])
@@ -187,9 +187,10 @@ def watch(_step, _said):
         )
 
 
-begin = int(np.argmax(ten.observe(walk.position_m).in_view.any(-1))) * 0.01
+seen = ten.observe(walk.position_m).in_view.any(-1)
+enters = np.flatnonzero(seen[1:] & ~seen[:-1])[0]  # steps of 10 ms
 short = walk.resampled(1e-3)
-first = max(0, round(begin * 1000) - 300)
+first = max(0, 10 * int(enters) - 300)
 steps = slice(first, first + 2000)
 animal.start(torch.from_numpy(short.position_m[first : first + 1]))
 said = animal.run(
@@ -226,8 +227,8 @@ plot_signals(
 # %%
 shift = np.array([0.15, -0.1])
 first_map, second_map = (slam_in(SSPSLAMConfig(**noisy), ten) for _ in range(2))
-simulate(first_map, [ten], [walk.first(70.0)])
-later = walk._replace(position_m=walk.position_m[6000:])
+simulate(first_map, [ten], [walk.first(35.0)])
+later = walk._replace(position_m=walk.position_m[3000:])
 start = torch.from_numpy(later.position_m[:1] + shift).clamp(-1, 1)
 second_map.start(start)
 second_map.run(

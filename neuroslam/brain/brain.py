@@ -1,14 +1,14 @@
 """The brain: odometry, views, a map and populations of cells, advanced frame by frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 
 from neuroslam.brain.state import BrainState
-from neuroslam.errors import BadFrame
+from neuroslam.errors import BadFrame, SourceError, first_line
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
     check_image,
@@ -94,8 +94,30 @@ class NavigationBrain(BrainState):
                 odometry nor an image. The state is unchanged, and another frame can follow; after
                 a gap, the second frame is accepted.
             MapError: If the robot would leave the space of a population; the state is unchanged.
+            RuntimeError: If a population refuses a frame elsewhere than in ``observe`` or
+                ``check``; or if an error interrupted an earlier frame, see :attr:`half_taken`.
         """
+        if self.half_taken:
+            raise RuntimeError(self.half_taken)
         accepted = self._accept(frame)
+        try:
+            return self._advance(accepted)
+        except BaseException as error:  # Ctrl-C too leaves some parts a frame ahead of others
+            hook = _hook_in(error, self._populations.values())
+            self.half_taken = (
+                f"frame {frame.index} is half taken: {hook or 'its step'} was interrupted by "
+                f"{type(error).__name__}; restore a state saved before it"
+            )
+            if isinstance(error, SourceError):  # else a caller would skip the frame and go on
+                raise RuntimeError(
+                    f"frame {frame.index}: {hook or 'the brain'} raised {type(error).__name__} "
+                    f"({first_line(error)}) after the state had changed; refuse a frame in observe "
+                    "or check"
+                ) from error
+            raise
+
+    def _advance(self, accepted: Accepted) -> StepResult:
+        """Advance by a checked frame."""
         now = self._enter(accepted)
         observed, leader = accepted.observed, self.leader
         made: list[tuple[Population | None, Correction | None]] = [
@@ -267,3 +289,15 @@ class NavigationBrain(BrainState):
                 + ("; set odometry.use to 'visual'" if use == "given" else " and no image")
             )
         return self.odometry.measure(frame.image, dt_s)
+
+
+def _hook_in(error: BaseException, populations: Iterable[Population]) -> str:
+    """Name the class and the method of a population in which an error was raised; else empty."""
+    at, known = error.__traceback__, list(populations)
+    while at is not None:
+        code = at.tb_frame.f_code
+        owner = at.tb_frame.f_locals.get(code.co_varnames[0]) if code.co_argcount else None
+        if any(owner is population for population in known):
+            return f"{type(owner).__name__}.{code.co_name}()"
+        at = at.tb_next
+    return ""

@@ -12,6 +12,7 @@ from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.config import BrainConfig
+from neuroslam.config.populations import HOMES
 from neuroslam.errors import ConfigError, counted
 from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
@@ -22,6 +23,7 @@ from neuroslam.merging.match import shared_history
 from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
 from neuroslam.state.population import Population
@@ -54,8 +56,14 @@ class BrainState(nn.Module):
     Args:
         config: All parameters.
         features: Network that computes views, if ``config.view.features`` is ``"module"``.
+
+    Attributes:
+        half_taken: Why the state is not that of any frame: an error interrupted a frame after the
+            state had begun to change. The brain then takes no frame and cannot be saved, stored or
+            merged, until a state is loaded; empty: the state is sound.
     """
 
+    half_taken: str
     clock: Clock
     odometry: VisualOdometry
     view: LocalViewCells
@@ -82,11 +90,13 @@ class BrainState(nn.Module):
         self.about: tuple[str, str, str] = ("", "", "")
         self._detects = self.config.sessions.kidnapped == "detect"
         self._after_gap_s = -math.inf  # time of a frame that was refused after a gap
+        self.half_taken = ""
         self.clock = Clock(frame=-1, time_s=0.0, frames_seen=0)
         self.stored = ModulesOf()
         self._begin()
         self.register_load_state_dict_pre_hook(_make_stored)
-        self.register_load_state_dict_post_hook(lambda module, _: module._changed())
+        self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
+        self.register_state_dict_pre_hook(_refuse_half_taken)
 
     def _begin(self) -> None:
         """Start with an empty map."""
@@ -103,6 +113,13 @@ class BrainState(nn.Module):
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
+        self._changed()
+        if set(self._populations) - HOMES.keys():  # those of the package have names of their own
+            check_names(self._populations.values())
+
+    def _loaded(self) -> None:
+        """Go on from a whole state."""
+        self.half_taken = ""
         self._changed()
 
     def _changed(self) -> None:
@@ -359,6 +376,12 @@ class BrainState(nn.Module):
 
 def _overrides(population: type[Population], hook: str) -> bool:
     return getattr(population, hook) is not getattr(Population, hook)
+
+
+def _refuse_half_taken(module: BrainState, *_unused: object) -> None:
+    """Keep a state that is not that of any frame from being saved, stored or merged."""
+    if module.half_taken:
+        raise RuntimeError(module.half_taken)
 
 
 def _make_stored(module: BrainState, state: State, prefix: str, *_unused: object) -> None:

@@ -2,13 +2,13 @@ r"""Pure functions: the dynamics of pose cells and other attractors on a torus."
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.cells.convolve import Kernels, Packet, circulant, trim, widen
+from neuroslam.cells.convolve import Cell, Kernels, Packet, circulant, trim, widen, widened_origin
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, rotate_points
 from neuroslam.types import PoseEstimate
@@ -92,10 +92,10 @@ def settle(
     )
     if batch:
         n = torch.tensor(packet.shape, device=values.device)
-        origin = (packet.origin - torch.tensor(reach, device=values.device)) % n
+        first = cast(Tensor, packet.origin)
+        origin = (first - torch.tensor(reach, device=values.device)) % n
         return Packet(field, origin, packet.shape)
-    origin = tuple((o - r) % n for o, r, n in zip(packet.origin, reach, packet.shape, strict=True))
-    return trim(Packet(field, origin, packet.shape))
+    return trim(Packet(field, widened_origin(packet, reach), packet.shape))
 
 
 def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Tensor:
@@ -181,7 +181,7 @@ def path_integrate(
     turn = values.new_tensor(turn_cells)
     along_theta = shift_matrix(turn, first_theta, n_out_theta, sizes[0], n_theta)
     turned = (along_theta @ moved.flatten(-2, -1)).unflatten(-1, (n_out_y, n_out_x))
-    o_theta, o_y, o_x = packet.origin
+    o_theta, o_y, o_x = cast(Cell, packet.origin)
     origin = ((o_theta + first_theta) % n_theta, (o_y + first_y) % n_y, (o_x + first_x) % n_x)
     return Packet(turned, origin, packet.shape)
 
@@ -242,7 +242,8 @@ def inject(packet: Packet, at: PoseEstimate, energy: float) -> Packet:
     """
     where = (at.theta, at.y, at.x)
     corner = tuple(math.floor(c) for c in where)
-    packet = widen(packet, tuple(c % n for c, n in zip(corner, packet.shape, strict=True)))
+    theta, y, x = (c % n for c, n in zip(corner, packet.shape, strict=True))
+    packet = widen(packet, (theta, y, x))
     added = packet.values.new_tensor(energy)
     for axis, (c, low) in enumerate(zip(where, corner, strict=True)):
         weights = [0.0] * packet.values.shape[axis]

@@ -5,7 +5,7 @@ Activity of an attractor network is compact: some hundred cells of a hundred tho
 """
 
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,10 @@ from neuroslam.errors import MapError
 
 Kernels = tuple[Tensor, Tensor, Tensor]
 """One odd 1-D kernel for each axis, in the order theta, y, x."""
+
+
+Cell = tuple[int, int, int]
+"""A cell of the torus, or an extent in cells: theta, y, x."""
 
 
 class Packet(NamedTuple):
@@ -28,7 +32,7 @@ class Packet(NamedTuple):
     """
 
     values: Tensor
-    origin: tuple[int, int, int] | Tensor
+    origin: Cell | Tensor
     shape: tuple[int, int, int]
 
 
@@ -130,12 +134,13 @@ def circular_convolve(
         method = "window" if single else "separable"
     if method == "window":
         packet = to_packet(activity)
-        along = tuple(
+        theta, y, x = (
             circulant(kernel, n_in, n)
             for kernel, n_in, n in zip(kernels, packet.values.shape[-3:], packet.shape, strict=True)
         )
-        reach = tuple(kernel.shape[0] // 2 for kernel in kernels)
-        return to_dense(_moved(packet, multiply_axes(packet.values, along), reach))
+        a, b, c = (kernel.shape[0] // 2 for kernel in kernels)
+        values = multiply_axes(packet.values, (theta, y, x))
+        return to_dense(Packet(values, widened_origin(packet, (a, b, c)), packet.shape))
     batch = activity.shape[:-3]
     flat = activity.reshape(-1, 1, *activity.shape[-3:])
     if method == "dense":
@@ -154,9 +159,11 @@ def circular_convolve(
     return out.reshape(*batch, *activity.shape[-3:])
 
 
-def _moved(packet: Packet, values: Tensor, reach: tuple[int, int, int]) -> Packet:
-    origin = tuple((o - r) % n for o, r, n in zip(packet.origin, reach, packet.shape, strict=True))
-    return Packet(values, origin, packet.shape)
+def widened_origin(packet: Packet, reach: Cell) -> Cell:
+    """Return the first cell of one brain's window that is wider by ``reach`` on both sides."""
+    n_theta, n_y, n_x = packet.shape
+    theta, y, x = cast(Cell, packet.origin)
+    return (theta - reach[0]) % n_theta, (y - reach[1]) % n_y, (x - reach[2]) % n_x
 
 
 def to_packet(activity: Tensor) -> Packet:
@@ -168,7 +175,8 @@ def to_packet(activity: Tensor) -> Packet:
     Raises:
         MapError: If no cell is active.
     """
-    packet = Packet(activity, (0, 0, 0), tuple(activity.shape[-3:]))
+    n_theta, n_y, n_x = activity.shape[-3:]
+    packet = Packet(activity, (0, 0, 0), (n_theta, n_y, n_x))
     return packet if activity.dim() > 3 else trim(packet)
 
 
@@ -178,7 +186,7 @@ def to_dense(packet: Packet) -> Tensor:
     pads: list[int] = []
     for width, n in zip(values.shape[-3:], packet.shape, strict=True):
         pads = [0, n - width, *pads]
-    return torch.roll(F.pad(values, pads), packet.origin, dims=(-3, -2, -1))
+    return torch.roll(F.pad(values, pads), cast(Cell, packet.origin), dims=(-3, -2, -1))
 
 
 def trim(packet: Packet) -> Packet:
@@ -190,7 +198,7 @@ def trim(packet: Packet) -> Packet:
     layers = packet.values.detach().flatten(1)  # two axes at a time: five times faster
     plane = layers.amax(0).unflatten(0, packet.values.shape[1:])
     masks = (layers.amax(1), plane.amax(1), plane.amax(0))
-    cut, rolls, origin = [], [0, 0, 0], list(packet.origin)
+    cut, rolls, origin = [], [0, 0, 0], list(cast(Cell, packet.origin))
     for axis, (mask, n) in enumerate(zip(masks, packet.shape, strict=True)):
         active = [i for i, peak in enumerate(mask.tolist()) if peak != 0.0]
         if not active:
@@ -212,15 +220,16 @@ def trim(packet: Packet) -> Packet:
     kept = packet.values
     if any(rolls):
         kept = torch.roll(kept, rolls, dims=(0, 1, 2))
-    return Packet(kept[cut[0], cut[1], cut[2]], tuple(origin), packet.shape)
+    theta, y, x = origin
+    return Packet(kept[cut[0], cut[1], cut[2]], (theta, y, x), packet.shape)
 
 
 def widen(packet: Packet, cell: tuple[int, int, int], width: int = 2) -> Packet:
     """Grow the window by silent cells until it holds ``width`` cells from ``cell`` on."""
     pads: list[int] = []
-    origin = []
+    origin: list[int] = []
     sizes = packet.values.shape[-3:]
-    for o, size, c, n in zip(packet.origin, sizes, cell, packet.shape, strict=True):
+    for o, size, c, n in zip(cast(Cell, packet.origin), sizes, cell, packet.shape, strict=True):
         ahead = (c - o) % n  # of the window's first cell
         after = max(0, ahead + width - size) if size < n else 0
         before = n - ahead if after else 0
@@ -233,7 +242,8 @@ def widen(packet: Packet, cell: tuple[int, int, int], width: int = 2) -> Packet:
         origin.append((o - before) % n)
     if not any(pads):
         return packet
-    return Packet(F.pad(packet.values, pads), tuple(origin), packet.shape)
+    theta, y, x = origin
+    return Packet(F.pad(packet.values, pads), (theta, y, x), packet.shape)
 
 
 def fourier_convolve(activity: Tensor, transfer: Tensor) -> Tensor:

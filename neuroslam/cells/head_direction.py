@@ -6,9 +6,9 @@ and the merge of two sessions. The model is that of Skaggs et al. (1995,
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -288,9 +288,9 @@ def make_ring(config: HeadDirectionConfig) -> Ring:
     Excitation is a wrapped Gaussian, :math:`\hat w_k = e^{-k^2\sigma^2/2}`, scaled to a peak of 1;
     inhibition :math:`\varphi` is uniform, so the kernel is :math:`w - \varphi`.
     """
-    n, like = config.n, {"dtype": torch.float64}
-    k = torch.arange(n // 2 + 1, **like)
-    angles = torch.arange(n, **like) * TWO_PI / n
+    n = config.n
+    k = torch.arange(n // 2 + 1, dtype=torch.float64)
+    angles = torch.arange(n, dtype=torch.float64) * TWO_PI / n
     excite = torch.exp(-0.5 * (k * math.radians(config.excite_deg)) ** 2)
     excite = excite / torch.fft.irfft(excite.to(torch.complex128), n=n)[0]
     excite[0] -= n * config.inhibition
@@ -309,9 +309,12 @@ def make_ring(config: HeadDirectionConfig) -> Ring:
     spectrum = torch.fft.rfft(bump).real  # even, as at the start
     parts = [_parts(spectrum[None], angles, wave)[:, 0] for wave in (np.cos, np.sin)]
     dtype = getattr(torch, config.precision)
-    tensors = (order, quarter, kernels, torch.cat(parts), windows)
     return Ring(
-        *(t.to(dtype).contiguous() for t in tensors),
+        order.to(dtype).contiguous(),
+        quarter.to(dtype).contiguous(),
+        kernels.to(dtype).contiguous(),
+        torch.cat(parts).to(dtype).contiguous(),
+        windows.to(dtype).contiguous(),
         float(bump.max()),
         config.gain,
         config.exponent,
@@ -376,7 +379,7 @@ class HeadDirectionCells(Population):
         super().__init__()
         self.config = config or HeadDirectionConfig()
         self.batch = batch
-        self.ring = make_ring(self.config)
+        self.ring: Ring = make_ring(cast(Hashable, self.config))
         start = 0.0 if batch is None else torch.zeros(batch, dtype=torch.float64)
         self.register_buffer("activity", bump_at(self.ring, start))
         self.views = GrowingTable({"heading_rad": ((), torch.float64)})
@@ -454,9 +457,9 @@ class HeadDirectionCells(Population):
             Correction of the heading, in radians; 0 in a batch.
         """
         share = -math.expm1(-dt_s / time_s)
-        before = self.heading_rad if self.batch is None else 0.0
+        before = cast(float, self.heading_rad) if self.batch is None else 0.0
         self.activity = inject(self.activity, heading_rad, share, self.ring)
-        return wrap_angle(self.heading_rad - before) if self.batch is None else 0.0
+        return wrap_angle(cast(float, self.heading_rad) - before) if self.batch is None else 0.0
 
     def update_from_view(self, view: ViewMatch, dt_s: float) -> float:
         """Bind a new view to the heading; correct the heading by a known one.
@@ -506,7 +509,7 @@ class HeadDirectionCells(Population):
         if self.batch is not None:
             self.activity = turned(self.activity, compass_rad - self.heading_rad)
         else:
-            turn = wrap_angle(compass_rad - self.heading_rad)
+            turn = wrap_angle(cast(float, compass_rad) - cast(float, self.heading_rad))
             self.activity = turned(self.activity, turn)
             old = self.views["heading_rad"]
             self.views.replace(heading_rad=(old + turn + math.pi) % TWO_PI - math.pi)
@@ -515,7 +518,8 @@ class HeadDirectionCells(Population):
     def _apply(self, fn: object, recurse: bool = True) -> "HeadDirectionCells":
         super()._apply(fn, recurse)
         like, self._decoded = self.activity, (None, 0.0)
-        self.ring = Ring(*(v.to(like) if isinstance(v, Tensor) else v for v in self.ring))
+        moved = {k: v.to(like) for k, v in self.ring._asdict().items() if isinstance(v, Tensor)}
+        self.ring = self.ring._replace(**moved)
         return self
 
     @without_gradients
@@ -555,7 +559,8 @@ class HeadDirectionCells(Population):
         if view.is_new or view.template >= self.views.n - self.config.inject_after:
             return None
         learnt = self.views["heading_rad"][view.template].item()
-        return wrap_angle(learnt + view.relative_heading_rad - self.heading_rad)
+        heading = cast(float, self.heading_rad)
+        return wrap_angle(learnt + view.relative_heading_rad - heading)
 
     # ------------------------------------------------------- protocol of a population
 

@@ -167,14 +167,14 @@ class OscillatoryInterference(nn.Module):
         self.theta_hz, self.threshold, self.batch = theta_hz, threshold, batch
         self.n_cells = n_cells * len(spacings_m)
         generator = generator or torch.Generator().manual_seed(0)
-        n_modules, like = len(spacings_m), {"dtype": torch.float64}
-        drawn = torch.rand(n_modules, generator=generator, **like) * (TWO_PI / 6)
-        turned = drawn if orientations_rad is None else torch.tensor(orientations_rad, **like)
+        n_modules, dtype = len(spacings_m), torch.float64
+        drawn = torch.rand(n_modules, generator=generator, dtype=dtype) * (TWO_PI / 6)
+        turned = drawn if orientations_rad is None else torch.tensor(orientations_rad, dtype=dtype)
         axes = torch.stack([turned, turned + TWO_PI / 6], dim=-1)
         axes = torch.stack([axes.cos(), axes.sin()], dim=-1)  # (modules, 2, 2): a cell of the grid
-        fields = torch.rand(n_modules, n_cells, 2, generator=generator, **like) @ axes
+        fields = torch.rand(n_modules, n_cells, 2, generator=generator, dtype=dtype) @ axes
         waves = lattice_waves(turned, directions)
-        self.register_buffer("spacings_m", torch.tensor(list(spacings_m), **like))
+        self.register_buffer("spacings_m", torch.tensor(list(spacings_m), dtype=dtype))
         self.register_buffer("directions", waves)
         # In units of the spacing, so a cell keeps its phase when the spacing changes.
         self.register_buffer("offset_rad", _WAVE_NUMBER * fields @ waves.transpose(-1, -2))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from neuroslam.cells.boundary_vectors import squared_mismatch, wrap
@@ -53,7 +53,7 @@ def join_navigation(loaded: State, partial: State, join: Join) -> State:
     """Merge the states of navigation cells; neither is altered.
 
     Place cells nearer to each other than ``threshold_m`` become one, and their visits add; if each
-    is an experience of the map, those become one whose experiences do. Stretches of wall that both
+    is an experience of the map, those become one whose experiences do. Wall segments that both
     remember become one. The partial session's position and phases move.
 
     Args:
@@ -97,7 +97,7 @@ def view_frames(loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] 
     turns = other[:, 2] - one[:, 2] + join.view_turns_rad[same][sure]
     turn = math.atan2(np.sin(turns).mean(), np.cos(turns).mean())
     middle, onto = one[:, :2].mean(0), other[:, :2].mean(0)
-    return Pose(*middle.tolist(), 0.0), Pose(*onto.tolist(), turn)
+    return Pose(float(middle[0]), float(middle[1]), 0.0), Pose(float(onto[0]), float(onto[1]), turn)
 
 
 def _seen(state: State) -> np.ndarray:
@@ -112,7 +112,7 @@ def _same_places(loaded: State, partial: State, frames: Frames) -> np.ndarray:
     if n and m:
         threshold = float(loaded["place.threshold_m"])
         moved = frames.place(partial["place.centres_m"][0, :m])
-        away, nearest = cKDTree(loaded["place.centres_m"][0, :n].numpy()).query(moved.numpy())
+        away, nearest = KDTree(loaded["place.centres_m"][0, :n].numpy()).query(moved.numpy())
         ids = np.where(away < threshold, nearest, -1)
         ids[ids < 0] = n + np.arange((ids < 0).sum())
     return ids

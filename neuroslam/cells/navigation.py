@@ -337,7 +337,7 @@ class NavigationCells(Population):
     def remembered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return centres of place cells ``(n, 2)``, links ``(m, 2)``, and walls ``(w, 2)``.
 
-        A stretch of wall is given by the foot of the perpendicular from its anchor.
+        A wall segment is given by the foot of the perpendicular from its anchor.
         """
         centres, links = (part.numpy(force=True) for part in self.place.graph())
         columns = self.walls.remembered()[0][:4]

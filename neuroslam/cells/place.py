@@ -1,6 +1,6 @@
 """Place cells: a competitive Hebbian network on grid cells that recruits cells as it explores."""
 
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor
@@ -280,13 +280,14 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         at = torch.where(is_in.any(1), is_in.long().argmax(1), away[rows].argmax(1))
         self._write_back(rows)  # before another cell takes the slot
         self.window = self.window.index_put((rows, at), new)
-        self._near[0][rows, at] = grid[rows]
-        self._near[1][rows, at] = position[rows]
+        weights, centres = cast(tuple[Tensor, Tensor], self._near)
+        weights[rows, at] = grid[rows]
+        centres[rows, at] = position[rows]
         return slot.index_put((rows,), at)
 
     def _learn(self, grid: Tensor, slot: Tensor, learns: Tensor | None) -> None:
         """Let the winners learn in the window; :meth:`_write_back` copies it to the table."""
-        near = self._near[0]
+        near = cast(tuple[Tensor, Tensor], self._near)[0]
         at = slot[:, None, None].expand(-1, 1, near.shape[-1])
         before = near.gather(1, at)
         after = hebbian_step(before, grid.unsqueeze(1), self.config.hebbian_rate)

@@ -1,9 +1,9 @@
 """Pose cells: an attractor over x, y and heading, moved by odometry and corrected by views."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self, cast
 
 import numpy as np
 import torch
@@ -80,6 +80,7 @@ class PoseCellNetwork(Population):
 
     window: Tensor
     origin: Tensor
+    slip: Tensor
 
     @classmethod
     def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
@@ -118,11 +119,11 @@ class PoseCellNetwork(Population):
     @property
     def kernels(self) -> tuple[Kernels, Kernels]:
         """Excitation and inhibition kernels: the 1-D factors for theta, y and x."""
-        c, like = self.config, {"dtype": torch.float64}
-        place = gaussian_kernel(c.excite_size, c.excite_std_xy, **like)
-        excite = (gaussian_kernel(c.excite_size, c.excite_std_theta, **like), place, place)
-        place = gaussian_kernel(c.inhibit_size, c.inhibit_std_xy, **like)
-        inhibit = (gaussian_kernel(c.inhibit_size, c.inhibit_std_theta, **like), place, place)
+        c = self.config
+        place = gaussian_kernel(c.excite_size, c.excite_std_xy)
+        excite = (gaussian_kernel(c.excite_size, c.excite_std_theta), place, place)
+        place = gaussian_kernel(c.inhibit_size, c.inhibit_std_xy)
+        inhibit = (gaussian_kernel(c.inhibit_size, c.inhibit_std_theta), place, place)
         return excite, inhibit
 
     @property
@@ -174,7 +175,8 @@ class PoseCellNetwork(Population):
             MapError: If inhibition silenced every cell.
         """
         c, now = self.config, self._now
-        sizes = tuple(now.packet.values.shape[-3:])
+        a, b, width = now.packet.values.shape[-3:]
+        sizes = (a, b, width)
         coupled = self._couplings.get(sizes)
         if coupled is None:
             with torch.inference_mode(mode=False):  # kept for steps that may want gradients
@@ -183,7 +185,8 @@ class PoseCellNetwork(Population):
                     *(m.to(device=self.window.device, dtype=self.window.dtype) for m in made)
                 )
             self._couplings[sizes] = coupled
-        reach = (c.excite_size // 2,) * 3
+        half = c.excite_size // 2
+        reach = (half, half, half)
         distance = motion.v_m_s * motion.dt_s / c.cell_size_m
         turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
         follows = c.exact_gain and not now.injected
@@ -193,13 +196,15 @@ class PoseCellNetwork(Population):
         before = self.estimate if follows else None
         settled = settle(now.packet, coupled, reach, c.global_inhibition)
         if self.batch is None:
-            x, y, theta = now.slip
+            x, y, theta = cast(list[float], now.slip)
             self.packet = path_integrate(settled, distance, turn + theta, (x, y))
+            if follows:
+                self._measure_slip(cast(PoseEstimate, before), distance, turn)
         else:
-            settled = trim_all(settled)
-            self.packet = move_all(settled, distance, turn + now.slip[:, 2], now.slip[:, :2])
-        if follows:
-            self._measure_slip(before, distance, turn)
+            settled, slip = trim_all(settled), cast(Tensor, now.slip)
+            self.packet = move_all(settled, distance, turn + slip[:, 2], slip[:, :2])
+            if follows:
+                self._measure_slips(cast(Tensor, before), distance, turn)
         return self.estimate
 
     def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
@@ -210,9 +215,7 @@ class PoseCellNetwork(Population):
             aside = torch.tensor([dx_cells, dy_cells]).expand(self.batch, 2)
             self.packet = move_all(self.packet, 0.0, turn_cells, aside)
 
-    def _measure_slip(
-        self, before: PoseEstimate | Tensor, distance: float | Tensor, turn: float | Tensor
-    ) -> None:
+    def _measure_slip(self, before: PoseEstimate, distance: float, turn: float) -> None:
         r"""Measure the lag of the estimate behind odometry, for which the next step compensates.
 
         Clipping at zero holds a moving packet back, by a tenth at 0.1 cells a step. Only views may
@@ -220,29 +223,34 @@ class PoseCellNetwork(Population):
         :math:`s \leftarrow s + \Delta_\text{odometry} - \Delta_\text{estimate}` is fed back,
         and reset where the estimate jumped (another packet won) or a view has just injected.
         """
-        after, slip = self.estimate, self._now.slip
+        after, slip = cast(PoseEstimate, self.estimate), cast(list[float], self._now.slip)
         sizes = (self.shape[2], self.shape[1], self.shape[0])
-        if self.batch is None:
-            heading = TWO_PI * before.theta / self.shape[0]
-            asked = (distance * math.cos(heading), distance * math.sin(heading), turn)
-            errors = [
-                (was + step - is_ + n / 2) % n - n / 2
-                for was, step, is_, n in zip(before, asked, after, sizes, strict=True)
-            ]
-            jumped = max(map(abs, errors)) > 1.0
-            self._now.slip = (
-                [0.0, 0.0, 0.0] if jumped else [s + e for s, e in zip(slip, errors, strict=True)]
-            )
-        else:
-            heading = TWO_PI * before[:, 2] / self.shape[0]
-            asked = torch.stack(
-                torch.broadcast_tensors(distance * heading.cos(), distance * heading.sin(), turn),
-                dim=1,
-            )
-            n = torch.tensor(sizes, dtype=before.dtype, device=before.device)
-            errors = (before + asked - after + n / 2) % n - n / 2
-            kept = (errors.abs() <= 1.0).all(1, keepdim=True)
-            self._now.slip = (slip + errors.to(slip)).where(kept, 0.0)
+        heading = TWO_PI * before.theta / self.shape[0]
+        asked = (distance * math.cos(heading), distance * math.sin(heading), turn)
+        errors = [
+            (was + step - is_ + n / 2) % n - n / 2
+            for was, step, is_, n in zip(before, asked, after, sizes, strict=True)
+        ]
+        jumped = max(map(abs, errors)) > 1.0
+        self._now.slip = (
+            [0.0, 0.0, 0.0] if jumped else [s + e for s, e in zip(slip, errors, strict=True)]
+        )
+
+    def _measure_slips(
+        self, before: Tensor, distance: float | Tensor, turn: float | Tensor
+    ) -> None:
+        """Do the same for each brain of a batch."""
+        after, slip = cast(Tensor, self.estimate), cast(Tensor, self._now.slip)
+        sizes = (self.shape[2], self.shape[1], self.shape[0])
+        heading = TWO_PI * before[:, 2] / self.shape[0]
+        asked = torch.stack(
+            torch.broadcast_tensors(distance * heading.cos(), distance * heading.sin(), turn),
+            dim=1,
+        )
+        n = torch.tensor(sizes, dtype=before.dtype, device=before.device)
+        errors = (before + asked - after + n / 2) % n - n / 2
+        kept = (errors.abs() <= 1.0).all(1, keepdim=True)
+        self._now.slip = (slip + errors.to(slip)).where(kept, 0.0)
 
     def update_from_view(self, view: ViewMatch) -> None:
         r"""Bind a new view to the present estimate; inject activity where a known one was bound.
@@ -263,7 +271,7 @@ class PoseCellNetwork(Population):
                     f"PoseCellNetwork: new view {view.template}, expected {self.bindings.n}; "
                     "views and bindings must come from the same session"
                 )
-            at = self.estimate
+            at = cast(PoseEstimate, self.estimate)
             self.bindings.append(x=at.x, y=at.y, theta=at.theta, decay=c.active_decay)
             decay = self.bindings["decay"]
         elif view.template != NO_TEMPLATE:
@@ -300,7 +308,7 @@ class PoseCellNetwork(Population):
     def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:
         """Advance one frame: inject by the view, settle the attractor, move it by odometry."""
         self.update_from_view(view)
-        return self.integrate(motion)
+        return cast(PoseEstimate, self.integrate(motion))
 
     def step(self, now: StepInput, observation: Observation) -> None:
         """Advance by a frame of the brain; see :meth:`forward`."""
@@ -309,7 +317,7 @@ class PoseCellNetwork(Population):
     @property
     def heading_rad(self) -> float:
         """Heading of the estimate in the frame of the cells."""
-        return TWO_PI * self.estimate.theta / self.config.n_theta
+        return TWO_PI * cast(PoseEstimate, self.estimate).theta / self.config.n_theta
 
     def follow(self, correction: Correction) -> None:
         """Move and rotate the activity by the correction of another population."""
@@ -325,7 +333,8 @@ class PoseCellNetwork(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose-cell estimate."""
-        return Decision(*map_(now.motion, now.view, self.estimate, now.frame, kidnapped=now.vetoed))
+        cells = cast(PoseEstimate, self.estimate)
+        return Decision(*map_(now.motion, now.view, cells, now.frame, kidnapped=now.vetoed))
 
     @property
     def rates(self) -> np.ndarray:
@@ -350,7 +359,7 @@ class PoseCellNetwork(Population):
         """
         kept = torch.from_numpy(join.kept_views)
         moved = torch.from_numpy(join.view_cells).unbind(1)
-        columns = dict(zip(("x", "y", "theta"), moved, strict=True))
+        columns: dict[str, Tensor] = dict(zip(("x", "y", "theta"), moved, strict=True))
         columns["decay"] = partial["bindings.decay"]
         merged = {
             f"bindings.{name}": torch.cat([loaded[f"bindings.{name}"], column[kept]])
@@ -406,11 +415,12 @@ class PoseCellNetwork(Population):
 
     def _write_buffers(self) -> None:
         packet, slip = self._now.packet, self._now.slip
+        self.window = packet.values
         if self.batch is None:
-            self.window, self.origin = packet.values, torch.tensor(packet.origin)
+            self.origin = torch.tensor(packet.origin)
             self.slip = torch.tensor(slip, dtype=torch.float64)
         else:
-            (self.window, self.origin), self.slip = packet[:2], slip
+            self.origin, self.slip = cast(Tensor, packet.origin), cast(Tensor, slip)
 
     def _read_buffers(self) -> None:
         one = self.batch is None
@@ -421,7 +431,7 @@ class PoseCellNetwork(Population):
     def _apply(self, fn: object, recurse: bool = True) -> "PoseCellNetwork":
         self._couplings.clear()
         self._write_buffers()
-        super()._apply(fn, recurse)
+        super()._apply(cast(Callable[..., Any], fn), recurse)
         self._read_buffers()
         return self
 
@@ -431,4 +441,4 @@ def _take_window_size(
 ) -> None:
     saved = state.get(prefix + "window")
     if saved is not None:
-        module.window = module.window.new_empty(saved.shape)
+        module.window = cast(Tensor, module.window).new_empty(saved.shape)

@@ -85,9 +85,9 @@ def sheet_weights(parameters: SheetParameters) -> Tensor:
     Returns:
         Complex, ``(4, n_y, n_x // 2 + 1)``: layers that prefer +x, -x, +y, -y.
     """
-    p, like = parameters, {"dtype": torch.float64}
-    k_x = TWO_PI / _SIZE[0] * torch.arange(p.n_x // 2 + 1, **like)
-    k_y = TWO_PI / _SIZE[1] * torch.fft.fftfreq(p.n_y, 1.0 / p.n_y, **like)
+    p, dtype = parameters, torch.float64
+    k_x = TWO_PI / _SIZE[0] * torch.arange(p.n_x // 2 + 1, dtype=dtype)
+    k_y = TWO_PI / _SIZE[1] * torch.fft.fftfreq(p.n_y, 1.0 / p.n_y, dtype=dtype)
     squared = k_y[:, None] ** 2 + k_x**2
     # d w / d k = 0 at k^2 / 4 beta = 2 ln(surround) surround / (surround - 1).
     steepness = 2.0 * math.log(p.surround) * p.surround / (p.surround - 1.0)

@@ -7,6 +7,7 @@ On an accelerator, where shapes should not depend on values, the window is the w
 """
 
 from functools import lru_cache
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -31,7 +32,8 @@ def to_packets(activity: Tensor) -> Packet:
     if not bool(activity.flatten(1).any(1).all()):
         raise MapError("pose cells: no activity in a brain of the batch; expected some in each")
     origin = torch.zeros(len(activity), 3, dtype=torch.int64, device=activity.device)
-    return trim_all(Packet(activity, origin, tuple(activity.shape[-3:])))
+    n_theta, n_y, n_x = activity.shape[-3:]
+    return trim_all(Packet(activity, origin, (n_theta, n_y, n_x)))
 
 
 def to_tori(packets: Packet) -> Tensor:
@@ -42,7 +44,7 @@ def to_tori(packets: Packet) -> Tensor:
         >>> torch.equal(to_tori(to_packets(tori)), tori)
         True
     """
-    return _cut(packets, -packets.origin, packets.shape)
+    return _cut(packets, -_origins(packets), packets.shape)
 
 
 def trim_all(packets: Packet) -> Packet:
@@ -60,7 +62,11 @@ def trim_all(packets: Packet) -> Packet:
     n = _numbers(packets.shape, values.device)
     starts, reached = _longest_gaps(peaks != 0.0, n)
     kept = _cut(packets, starts, tuple(reached.amax(1).tolist()))
-    return Packet(kept, (packets.origin + starts) % n, packets.shape)
+    return Packet(kept, (_origins(packets) + starts) % n, packets.shape)
+
+
+def _origins(packets: Packet) -> Tensor:
+    return cast(Tensor, packets.origin)
 
 
 def _longest_gaps(active: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,7 +125,10 @@ def _cut(packets: Packet, starts: Tensor, sizes: tuple[int, ...]) -> Tensor:
 
 
 def move_all(
-    packets: Packet, distance_cells: Tensor, turn_cells: Tensor, aside_cells: Tensor
+    packets: Packet,
+    distance_cells: float | Tensor,
+    turn_cells: float | Tensor,
+    aside_cells: Tensor,
 ) -> Packet:
     """Move and turn the activity of each brain by its own odometry.
 
@@ -132,7 +141,7 @@ def move_all(
         aside_cells: x and y by which all layers move besides, ``(brains, 2)``.
     """
     values, sizes, shape = packets.values, packets.values.shape[1:], packets.shape
-    layers = packets.origin[:, :1] + torch.arange(sizes[0], device=values.device)
+    layers = _origins(packets)[:, :1] + torch.arange(sizes[0], device=values.device)
     heading = layers.to(values.dtype) * (TWO_PI / shape[0])
     directions = torch.stack([heading.cos(), heading.sin()], dim=1)  # (brains, 2, a)
     distance = torch.as_tensor(distance_cells, dtype=values.dtype, device=values.device)
@@ -148,7 +157,7 @@ def move_all(
     along_theta = shift_matrix(turn - first_theta, 0, n_out_theta, sizes[0], shape[0])
     turned = (along_theta @ moved.flatten(-2, -1)).unflatten(-1, (n_out_y, n_out_x))
     by = firsts.to(torch.int64)
-    return Packet(turned, (packets.origin + by) % _numbers(shape, values.device), shape)
+    return Packet(turned, (_origins(packets) + by) % _numbers(shape, values.device), shape)
 
 
 def _reaches(
@@ -185,4 +194,4 @@ def decode_all(packets: Packet, radius: int) -> Tensor:
     unit = TWO_PI / n.to(values.dtype)
     angles = (_places(2 * radius + 1, values.device) - radius) * unit[:, None]
     turn = torch.atan2((marginals * angles.sin()).sum(-1), (marginals * angles.cos()).sum(-1))
-    return ((peaks + packets.origin + turn / unit) % n).flip(-1)
+    return ((peaks + _origins(packets) + turn / unit) % n).flip(-1)

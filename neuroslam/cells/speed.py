@@ -7,7 +7,7 @@ and the merge of two sessions. After Kropff et al. (2015, *Nature* 523:
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 import torch
@@ -306,7 +306,10 @@ class SpeedCells(Population):
         """Return the decoded speed, and the mean rate."""
         if self.batch is not None:
             return {}
-        return {"speed/speed_m_s": self.speed_m_s, "speed/rate_hz": self.rates_hz.mean().item()}
+        return {
+            "speed/speed_m_s": cast(float, self.speed_m_s),
+            "speed/rate_hz": float(self.rates_hz.mean()),
+        }
 
     def images(self) -> dict[str, np.ndarray]:
         """Draw the rates of the cells as a row."""

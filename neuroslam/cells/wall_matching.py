@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from neuroslam.config import BrainConfig
@@ -73,10 +73,10 @@ def align_outlines(
         loaded: Outline that stays; not empty.
         partial: Outline that moves; not empty.
         turns_rad: Rotations to try.
-        reach_m: Extent of a stretch of wall.
+        reach_m: Extent of a wall segment.
         off_m: Largest distance between two walls that match.
     """
-    tree = cKDTree(loaded.feet_m)
+    tree = KDTree(loaded.feet_m)
     tried: list[tuple[int, float, np.ndarray]] = []
     for turn in turns_rad:
         turned = partial.moved(turn, np.zeros(2))
@@ -102,17 +102,16 @@ def align_outlines(
     return best._replace(runner_up=max(away, default=0))
 
 
-def _score(
-    tree: cKDTree, loaded: Outline, turned: Outline, move: np.ndarray, reach_m: float
-) -> int:
-    away, nearest = tree.query(turned.feet_m + move, distance_upper_bound=reach_m)
+def _score(tree: KDTree, loaded: Outline, turned: Outline, move: np.ndarray, reach_m: float) -> int:
+    away, found = tree.query(turned.feet_m + move, distance_upper_bound=reach_m)
+    nearest = np.asarray(found)
     met = np.isfinite(away)
     bearings = loaded.bearing_rad[nearest[met]]
     return int((np.abs(wrap_angles(turned.bearing_rad[met] - bearings)) < _BEARING_RAD).sum())
 
 
 def _refine(
-    tree: cKDTree,
+    tree: KDTree,
     loaded: Outline,
     partial: Outline,
     turn: float,
@@ -179,7 +178,7 @@ def match_walls(
     needed = max(_LEAST_WALLS, math.ceil(_LEAST_SHARE * min(counts)))
     if min(counts) < _LEAST_WALLS:
         return None, (
-            f"the maps remember {counts[0]} and {counts[1]} stretches of wall; both need "
+            f"the maps remember {counts[0]} and {counts[1]} wall segments; both need "
             f"{_LEAST_WALLS} to be aligned"
         )
     memory = config.wall_memory
@@ -187,7 +186,7 @@ def match_walls(
     off_m = _OFF_SIGMAS * memory.sigma_m
     best = align_outlines(*outlines, turns, memory.spread_m, off_m)
     aligned = (
-        f"{best.n_same} of {counts[1]} stretches of wall align with the other map's, "
+        f"{best.n_same} of {counts[1]} wall segments align with the other map's, "
         f"residual {best.off_m:.3f} m"
     )
     if best.n_same < needed:
@@ -224,7 +223,7 @@ def _same_experiences(
     """Pair experiences that are nearer than the smallest distance of two place cells."""
     loaded, partial = maps
     moved = Outline(partial[:, :2], partial[:, 2]).moved(alignment.turn_rad, alignment.move_m)
-    away, nearest = cKDTree(loaded[:, :2]).query(moved.feet_m)
+    away, nearest = map(np.asarray, KDTree(loaded[:, :2]).query(moved.feet_m))
     same = np.flatnonzero(away < threshold_m)
     if not len(same):
         return None
@@ -232,10 +231,11 @@ def _same_experiences(
     pairs = Pairs(same, nearest[same], turns, away[same])
     best = int(np.argmin(away[same]))
     z = same[best]
+    x_m, y_m = moved.feet_m[z]
     return Match(
         int(nearest[z]),
         int(z),
         float(turns[best]),
         others=pairs,
-        onto=Pose(*moved.feet_m[z].tolist(), float(moved.bearing_rad[z])),
+        onto=Pose(float(x_m), float(y_m), float(moved.bearing_rad[z])),
     )

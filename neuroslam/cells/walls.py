@@ -1,7 +1,7 @@
 r"""Memory of walls: remembered boundary vectors, and the correction of the position by them.
 
 A wall measures the position *perpendicular* to it, and nothing along it (Hardcastle et al. 2015).
-The memory of a stretch of wall is a boundary vector: the position of the animal (the anchor), and
+The memory of a wall segment is a boundary vector: the position of the animal (the anchor), and
 bearing and distance of the wall from there. An extended Kalman filter estimates the position, the
 errors of self-motion and the remembered distances together: a wall sensed early, before much drift,
 weighs more than one sensed late, and the constant errors of speed and compass are learnt too.
@@ -21,7 +21,7 @@ SAMPLE_S = 0.05
 """Correlation time of random errors of speed and heading, whatever the frame rate."""
 
 _OLD_S = 60.0  # only memories older than this tell whether the animal is lost
-_ABREAST = 0.2  # share of a stretch within which the wall must still be sensed
+_ABREAST = 0.2  # share of a segment within which the wall must still be sensed
 _ALIKE_RAD = math.radians(25.0)
 
 
@@ -33,7 +33,7 @@ class WallMemory(WallTable):
     (``errors``), and the motion since the last correction.
 
     Args:
-        config: Noise of motion and senses, extent of a stretch of wall.
+        config: Noise of motion and senses, extent of a wall segment.
         batch: Number of animals side by side, or ``None`` for one.
 
     Example:

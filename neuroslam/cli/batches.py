@@ -51,7 +51,7 @@ def sweep_command(
     overwrite: Overwrite = False,
 ) -> int:
     """Map sources with all combinations of values; exit 2 if a run failed."""
-    from neuroslam.runs.sweep import sweep, varied
+    from neuroslam.runs.sweep import counted_by_cells, sweep, varied
 
     so_far = (0, 0)
 
@@ -83,7 +83,7 @@ def sweep_command(
                 done, total = so_far
                 say(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
             raise
-    columns = ("templates", "experiences", "loop_closures", "place_cells", "ate_rmse_m")
+    columns = ["templates", "experiences", "loop_closures", *counted_by_cells(rows), "ate_rmse_m"]
     keys = [*varied(rows), *(key for key in columns if any(row.get(key) for row in rows))]
     say(down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
     failed = [row for row in rows if row["error"]]

@@ -1,5 +1,6 @@
 """Commands that make maps: run, resume, merge, demo."""
 
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -149,6 +150,8 @@ def demo_command(out: Out = Path("demo")) -> int:
 
 
 def _report(summary: "RunSummary", out: Path, command: str) -> int:
+    from neuroslam.runs.inspect import shown_count
+
     figures = summary.to_dict()
     for note in summary.skipped[:3]:
         complain(command, f"skipped: {note}")
@@ -169,13 +172,9 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
             if summary.pictures
             else "No experiences: the source has no images. Without a camera, use --preset slrb"
         )
-    if "place_cells" in figures:
-        lost = figures["lost_s"]
-        say(
-            f"{counted(figures['place_cells'], 'place cell')}, "
-            f"{counted(figures['walls'], 'wall segment')}; "
-            + (f"lost for {lost:.0f} s: walls did not fit the map" if lost else "never lost")
-        )
+    counts = [f"{name} {value}" for name, value in starmap(shown_count, summary.cells.items())]
+    if counts:
+        say(", ".join(counts))
     for report in summary.merges:
         _print_report(report)
     for report in summary.refusals[:3]:

@@ -10,19 +10,30 @@ from rich.table import Table
 from neuroslam.cli.options import Landmarks, MapFile, RunFolder
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
+from neuroslam.errors import counted
 
 if TYPE_CHECKING:
     from neuroslam.evaluation.trajectory import AlignmentMode
 
 
-def inspect_command(path: MapFile) -> int:
+def inspect_command(
+    path: MapFile,
+    tables: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Write bindings, experiences, goals, rates ... as CSV files there."
+        ),
+    ] = None,
+) -> int:
     """List the content of a map and its sessions."""
-    from neuroslam.runs.inspect import inspect
+    from neuroslam.runs.inspect import inspect, write_tables
 
     table = new_table("quantity", "value", title=str(path), headed=False)
     for name, value in inspect(path):
         table.add_row(name, value)
     say(table)
+    if tables is not None:
+        say(f"Written: {counted(len(write_tables(path, tables)), 'table')} in {tables}")
     return 0
 
 

@@ -214,15 +214,15 @@ class WallMemoryConfig(Section):
     spread_m: float = Field(
         default=0.25,
         gt=0,
-        description="distance within which a stretch of wall is one memory; larger: fewer, longer "
-        "stretches",
+        description="distance within which a wall segment is one memory; larger: fewer, longer "
+        "segments",
     )
     spread_deg: float = Field(
         default=12.0,
         gt=0,
         lt=90,
-        description="difference of bearing within which a stretch of wall is one memory; larger: "
-        "fewer stretches",
+        description="difference of bearing within which a wall segment is one memory; larger: "
+        "fewer segments",
     )
     period_s: float = Field(
         default=0.25,

@@ -419,3 +419,8 @@ class SessionConfig(Section):
         description="largest ratio of link residuals after a merge to those before; a merge above "
         "it is refused; larger: more merges are accepted",
     )
+    check_residuals: bool = Field(
+        default=True,
+        description="refuse a merge whose links do not fit after relaxation; false: accept every "
+        "merge, as in the paper",
+    )

@@ -6,7 +6,7 @@ and the linear code of speed.
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -185,11 +185,11 @@ def drift(out: Path, minutes: float, animals: int) -> list[dict[str, Any]]:
     alone, led = HeadDirectionCells(batch=animals), HeadDirectionCells(batch=animals)
     errors: dict[str, list[np.ndarray]] = {"alone": [], "led": []}
     for sensed, heading, heard in zip(rates + gyro, true, true + compass, strict=True):
-        motion = Motion(0.0, torch.from_numpy(sensed), DT_S)
+        motion = Motion(0.0, cast(Any, torch.from_numpy(sensed)), DT_S)
         alone.advance(motion)
-        led.advance(motion, CompassReading(torch.from_numpy(heard)))
-        errors["alone"].append(alone.heading_rad.numpy() - heading)
-        errors["led"].append(led.heading_rad.numpy() - heading)
+        led.advance(motion, CompassReading(cast(Any, torch.from_numpy(heard))))
+        errors["alone"].append(np.asarray(alone.heading_rad) - heading)
+        errors["led"].append(np.asarray(led.heading_rad) - heading)
     few = slice(None, _WITH_VIEWS)
     animals_with_views = zip((rates + gyro).T[few], true.T[few], strict=True)
     with_views = np.stack([errors_with_views(*one) for one in animals_with_views], axis=1)
@@ -264,12 +264,12 @@ def persistence(out: Path, minutes: float) -> list[dict[str, Any]]:
     noise = torch.rand(HeadDirectionConfig().n, generator=torch.Generator().manual_seed(0))
     bumps = bump_at(cells.ring, torch.from_numpy(start))
     cells.set_activity(torch.cat([bumps, noise[None].to(bumps)]))
-    still = Motion(0.0, torch.zeros(len(start) + 1, dtype=torch.float64), DT_S)
+    still = Motion(0.0, cast(Any, torch.zeros(len(start) + 1, dtype=torch.float64)), DT_S)
     headings, widths = [], []
     for k in range(round(60.0 * minutes / DT_S)):
         cells.advance(still)
         if k % 100 == 0:
-            headings.append(cells.heading_rad.numpy())
+            headings.append(np.asarray(cells.heading_rad))
             widths.append([tuning_width(rates) for rates in cells.rates[[1, -1]]])
     decoded = np.array(headings)[:, :-1]
     moved = np.degrees(wrap_angles(decoded - decoded[0]))

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -172,7 +172,7 @@ def pose_cells_alone(senses: Senses) -> PoseCellPath:
     with torch.inference_mode():
         estimates[0] = np.asarray(cells.estimate)
         for i, motion in enumerate(zip(distance.T, turn.T, strict=True)):
-            v, w = (torch.from_numpy(np.ascontiguousarray(x)) for x in motion)
+            v, w = (cast(Any, torch.from_numpy(np.ascontiguousarray(x))) for x in motion)
             estimates[i + 1] = np.asarray(cells.integrate(Motion(v, w, 1.0)))
     torus = np.array([config.n_xy, config.n_xy, config.n_theta])
     displacements = (np.diff(estimates, axis=0) + torus / 2) % torus - torus / 2

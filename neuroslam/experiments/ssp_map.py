@@ -34,6 +34,7 @@ def ssp_map(
     seconds: float = 60.0,
     tier: Literal["algebraic", "rate", "spiking"] = "spiking",
     n_random_maps: int = 100,
+    random_seconds: float = 120.0,
 ) -> dict[str, Any]:
     """Map the paper's world, answer the paper's queries, and count answers in random worlds.
 
@@ -44,6 +45,7 @@ def ssp_map(
         seconds: Duration of the walk; 60 in the paper.
         tier: Tier of the map that is drawn; random maps are algebraic.
         n_random_maps: Number of random maps.
+        random_seconds: Duration of the walk in each of them.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each query.
@@ -69,7 +71,7 @@ def ssp_map(
         plot_posterior(world, path.position_m, snapshots, "Belief about the animal's position"),
         out / "posterior.png",
     )
-    rows += count_right(n_random_maps)
+    rows += count_right(n_random_maps, seconds=random_seconds)
     return write_results(
         out, {"seconds": seconds, "tier": tier, "neurons": slam.n_neurons, "rows": rows}
     )

@@ -1,7 +1,7 @@
 """Experience map: a graph of experiences that odometry extends and relaxation makes consistent."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.graph import ExperienceGraph
 from neuroslam.mapping.least_squares import solve_pose_graph
+from neuroslam.mapping.planning import Plan
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.state.population import Action, Correction
@@ -267,18 +268,34 @@ class ExperienceMap(ExperienceGraph):
             )
         self.goals.append(experience=experience, until_s=self.state.time_s + timeout_s)
 
+    def plans(self) -> Iterator[tuple[int, Plan]]:
+        """Yield every goal in order, with the plan to it from the current experience.
+
+        The plan of a goal that cannot be reached has the reason. Such a goal stays in the list,
+        for a link made later can lead to it.
+        """
+        for goal in self.goals["experience"].tolist():
+            yield goal, self.plan(goal)
+
     def next_waypoint(self) -> int | None:
-        """Return the next experience on the path to the first goal; ``None`` without a path."""
-        if not self.goals.n:
-            return None
-        path = self.plan(int(self.goals["experience"][0])).path
-        return path[min(1, len(path) - 1)] if path else None
+        """Return the next experience on the path to the first goal that can be reached.
+
+        Returns:
+            The experience; the goal itself if the robot is there; ``None`` if no goal can be
+            reached, see :meth:`plans`.
+        """
+        path = next((plan.path for _, plan in self.plans() if plan.path), None)
+        return None if path is None else path[min(1, len(path) - 1)]
 
     def _drop_finished_goals(self) -> None:
         if not self.goals.n:
             return
         keep = self.goals["until_s"] > self.state.time_s
-        keep[0] &= self.goals["experience"][0] != self.state.current
+        here = (self.goals["experience"] == self.state.current).nonzero()
+        if len(here):  # reached, unless a goal before it can be reached and comes first
+            at = int(here[0])
+            before = self.goals["experience"][:at].tolist()
+            keep[at] &= any(self.plan(goal).path for goal in before)
         self.goals.replace(**{name: self.goals[name][keep] for name in self.goals.columns})
 
     def _add_link(self, source: int, target: int, relative_heading_rad: float) -> None:

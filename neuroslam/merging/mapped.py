@@ -83,6 +83,4 @@ def counts_of(brain: Mapped) -> dict[str, float]:
         "experiences": brain.map.n,
         "links": brain.map.n_links,
     }
-    for population in brain.populations.values():
-        counts |= answers.counts_of(population)
-    return counts
+    return counts | answers.gathered(brain.populations.values(), answers.counts_of)

@@ -12,11 +12,14 @@ from safetensors import safe_open
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import counted
+from neuroslam.errors import RunError, counted
 from neuroslam.mapping.tables import closes_loop
-from neuroslam.runs.files import brain_file
-from neuroslam.state.answers import counts_of
+from neuroslam.runs.files import brain_file, write_text
+from neuroslam.state.answers import counts_of, gathered
 from neuroslam.state.sessions import Session
+from neuroslam.state.tables import GrowingTable
+
+_WIDEST = 16  # numbers of a row in one column
 
 
 def inspect(path: str | Path) -> list[tuple[str, str]]:
@@ -67,6 +70,56 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
     return rows
 
 
+def write_tables(path: str | Path, out: str | Path) -> list[Path]:
+    """Write the state of a brain as CSV files that a person can read.
+
+    One file for each table that grows, ``PART.TABLE.csv``, such as ``pose_cells.bindings.csv``,
+    ``map.experiences.csv`` and ``map.goals.csv``; one for the activity of each population,
+    ``PART.rates.csv``; and those that populations write into the folder of a run. Your own
+    populations take part. Columns wider than 16 numbers, the pixels of templates, are left out.
+
+    Args:
+        path: Brain file, or folder of a run.
+        out: Folder to write; it is made if there is none.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        CheckpointError: If the brain cannot be read.
+        RunError: If ``out`` is a file.
+    """
+    brain, out = load_brain(brain_file(path)), Path(out)
+    if out.is_file():
+        raise RunError(f"{out}: is a file; expected a folder to write tables into")
+    out.mkdir(parents=True, exist_ok=True)
+    texts: dict[str, str] = {}
+    for name, part in brain.named_modules():
+        if isinstance(part, GrowingTable):
+            texts[f"{name}.csv"] = _table_csv(part)
+    for population in brain.populations.values():
+        if population.rates is not None:
+            rates = enumerate(population.rates.tolist())
+            lines = [f"{cell},{rate!r}" for cell, rate in rates]
+            texts[f"{population.name}.rates.csv"] = "\n".join(["cell,rate", *lines]) + "\n"
+        texts |= population.tables()
+    for name, text in texts.items():
+        write_text(out / name, text)
+    return [out / name for name in texts]
+
+
+def _table_csv(table: GrowingTable) -> str:
+    columns: dict[str, list[Any]] = {}
+    for name in table.columns:
+        values = table[name].flatten(1) if table[name].dim() > 1 else table[name][:, None]
+        width = values.shape[1]
+        if width <= _WIDEST:
+            parts = [name] if table[name].dim() == 1 else [f"{name}_{i}" for i in range(width)]
+            columns |= dict(zip(parts, values.T.tolist(), strict=True))
+    rows = zip(*columns.values(), strict=True)
+    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows)]) + "\n"
+
+
 def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
     links = brain.map.links
     rows = [("templates", str(brain.view.n))] if brain.view.n or brain.leader.needs_views else []
@@ -75,16 +128,15 @@ def _counts(brain: NavigationBrain) -> list[tuple[str, str]]:
         ("links", str(brain.map.n_links)),
         ("loop closures", str(int(closes_loop(links.source, links.target).sum()))),
     ]
-    for population in brain.populations.values():
-        rows += [_count(name, value) for name, value in counts_of(population).items()]
-    return rows
+    counts = gathered(brain.populations.values(), counts_of)
+    return rows + [shown_count(name, value) for name, value in counts.items()]
 
 
-def _count(name: str, value: float) -> tuple[str, str]:
+def shown_count(name: str, value: float) -> tuple[str, str]:
     """Format a count; a suffix of its name can be its unit.
 
     Example:
-        >>> _count("place_cells", 3), _count("lost_s", 1.25)
+        >>> shown_count("place_cells", 3), shown_count("lost_s", 1.25)
         (('place cells', '3'), ('lost', '1.2 s'))
     """
     if name.endswith(("_s", "_m", "_hz")):

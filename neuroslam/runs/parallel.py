@@ -6,6 +6,7 @@ Each call runs with one thread of torch and OpenCV, so results are equal whereve
 import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections import deque
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 import cv2
 import torch
 
+from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
 
 T = TypeVar("T")
@@ -204,12 +206,13 @@ def _on_ray(
         _connect(ray, address, jobs)
     running: dict[Any, int] = {}
     try:
-        task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt)
+        task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt_on_ray)
+        plugins = os.environ.get(PLUGINS, "")
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
                 number, item = waiting.popleft()
-                running[task.remote(function, item)] = number
+                running[task.remote(plugins, pickle.dumps((function, item)))] = number
             (done,), _ = ray.wait(list(running), num_returns=1)
             number = running.pop(done)
             try:
@@ -222,6 +225,23 @@ def _on_ray(
             ray.cancel(unfinished, force=True)
         if started_here:
             ray.shutdown()
+
+
+def _attempt_on_ray(plugins: str, call: bytes) -> object:
+    """Attempt a call in a worker, which gets no environment of this process.
+
+    Args:
+        plugins: Value of :data:`~neuroslam.config.populations.PLUGINS`.
+        call: Function and item, pickled: an item can hold a config, whose populations have to be
+            known when it is unpickled.
+    """
+    os.environ[PLUGINS] = plugins
+    try:
+        known_kinds()  # loads the plugins: the item can hold a class of one
+        function, item = pickle.loads(call)
+    except NeuroslamError as error:  # a plugin is not on this machine
+        return error
+    return _attempt(function, item)
 
 
 def _connect(ray: ModuleType, address: str, jobs: int | None) -> None:

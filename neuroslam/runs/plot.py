@@ -53,7 +53,13 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
                 figures |= _DRAWN[kind](population, path)
             else:
                 for tag, picture in pictures_of(population).items():
-                    figures[f"{tag.replace('/', '_')}.png"] = plot_activity(picture, tag)
+                    name = f"{tag.replace('/', '_')}.png"
+                    if name in {"map.png", "signals.png", *figures}:
+                        raise TypeError(
+                            f"{type(population).__name__}.images(): {tag!r} would be drawn as "
+                            f"{name}, which is another figure; rename"
+                        )
+                    figures[name] = plot_activity(picture, tag)
         figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():
             save(figure, to / name)

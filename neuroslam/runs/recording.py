@@ -14,7 +14,7 @@ from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import render
 from neuroslam.runs.panels import PANELS, Panels
-from neuroslam.state.answers import pictures_of, scalars_of
+from neuroslam.state.answers import gathered, pictures_of, scalars_of
 from neuroslam.state.population import Picture
 from neuroslam.types import Frame, StepResult
 
@@ -125,9 +125,8 @@ class TensorBoardRecorder(Recorder):
                 template = brain.view.template_image(result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
-            for population in brain.populations.values():
-                for tag, activity in pictures_of(population).items():
-                    self._write_picture(tag, coloured(activity), result.frame)
+            for tag, activity in gathered(brain.populations.values(), pictures_of).items():
+                self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
 
@@ -156,8 +155,7 @@ class TensorBoardRecorder(Recorder):
         }
         if result.view.error >= 0:
             values["view/match_error"] = result.view.error
-        for population in brain.populations.values():
-            values |= scalars_of(population)
+        values |= gathered(brain.populations.values(), scalars_of)
         for panels in self._panels.values():
             panels.write_scalars(result.frame)
         for tag, value in values.items():

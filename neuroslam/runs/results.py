@@ -21,7 +21,7 @@ from neuroslam.runs.files import (
 )
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import odometry_track, read_metrics, read_trace, trajectory, true_poses
-from neuroslam.state.answers import counts_of, tables_of
+from neuroslam.state.answers import RUN_FIGURES, counts_of, gathered, tables_of
 
 
 @dataclass
@@ -44,6 +44,11 @@ class RunSummary:
     tables: list[str] = field(default_factory=list)
     unplaced: int = 0
     failure: str = ""
+
+    @property
+    def cells(self) -> dict[str, float]:
+        """What the populations count, by name."""
+        return {name: n for name, n in self.counts.items() if name not in RUN_FIGURES}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures by name; the name ends with the unit."""
@@ -101,10 +106,8 @@ def write_results(
         "links": brain.map.n_links,
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
-    tables: dict[str, str] = {}
-    for population in brain.populations.values():
-        summary.counts |= counts_of(population)
-        tables |= tables_of(population)
+    summary.counts |= gathered(brain.populations.values(), counts_of)
+    tables = gathered(brain.populations.values(), tables_of)
     summary.tables = list(tables)
     if truth is not None:
         # A robot that did not move: the alignment with the truth is undetermined.

@@ -290,7 +290,9 @@ def _drive(
                 save()
                 if interrupts:
                     break
-    except (SourceError, MapError) as error:  # the map so far is kept
+    except (SourceError, MapError) as error:
+        if brain.half_taken:  # no state to write: what was saved before is kept
+            raise RunError(f"{error}; the map is not written: {brain.half_taken}") from error
         summary.failure = str(error)
     summary.interrupted = bool(interrupts)
     # A resumed run reads the bad frames after its last good one again: count them once.

@@ -21,6 +21,7 @@ from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.run import resolve_config, run
 from neuroslam.sensors.open import absolute_spec, seeded_spec
+from neuroslam.state.answers import RUN_FIGURES
 
 SUMMARY = "sweep.json"
 
@@ -322,6 +323,20 @@ def varied(rows: Sequence[dict[str, Any]]) -> list[str]:
     """
     keys = list(itertools.takewhile(lambda key: key not in ("frames", "error"), rows[0]))[1:]
     return [key for key in keys if len({str(row[key]) for row in rows}) > 1] or ["run"]
+
+
+def counted_by_cells(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the names of what the populations of the runs of a sweep count.
+
+    Example:
+        >>> row = {"run": "1", "seed": 0, "frames": 9, "links": 2, "visits": 3, "error": ""}
+        >>> counted_by_cells([row])
+        ['visits']
+    """
+    names = dict.fromkeys(
+        key for row in rows for key in itertools.dropwhile(lambda key: key != "frames", row)
+    )
+    return [name for name in names if name not in RUN_FIGURES and name != "error"]
 
 
 def _write(out: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:

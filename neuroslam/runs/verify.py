@@ -24,7 +24,7 @@ from neuroslam.runs.files import (
     missing_rows,
 )
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
-from neuroslam.state.answers import tables_of
+from neuroslam.state.answers import gathered, tables_of
 from neuroslam.state.mergeable import State
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, session_name
@@ -239,8 +239,7 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         "experiences.csv": experiences_csv(brain),
         "links.csv": links_csv(brain.map.links),
     }
-    for population in brain.populations.values():
-        expected |= tables_of(population)
+    expected |= gathered(brain.populations.values(), tables_of)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:

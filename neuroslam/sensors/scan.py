@@ -16,7 +16,7 @@ from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.sensors.frames import checked_array
 
 _WINDOW_M = 0.06  # half the window: shows a corner of 90 degrees, but not the curve of a pillar
-_WALL_M = 0.25  # half the longest stretch of a wall that is fitted
+_WALL_M = 0.25  # half the longest wall segment that is fitted
 _MIN_POINTS = 5  # of a wall
 _OUTLIER = 3.0  # tolerances
 _BENT, _SHARP = 2.5, 3.0  # standard deviations that distinguish a curve, a corner from a line

@@ -65,7 +65,8 @@ def shared_frames(
     if best is None or best.sum() < confirm or 2 * best.sum() <= len(both):
         return None
     turn = _turn_between(start[best], onto[best])
-    return Pose(*start[best].mean(0).tolist(), 0.0), Pose(*onto[best].mean(0).tolist(), turn)
+    (x, y), (onto_x, onto_y) = start[best].mean(0).tolist(), onto[best].mean(0).tolist()
+    return Pose(x, y, 0.0), Pose(onto_x, onto_y, turn)
 
 
 def _turn_between(start_m: np.ndarray, onto_m: np.ndarray) -> float:

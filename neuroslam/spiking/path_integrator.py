@@ -1,6 +1,7 @@
 """Path integration by velocity-controlled oscillators, each a population of neurons."""
 
 import math
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -83,7 +84,7 @@ def coupled(
     if config.coupling == "manifold":
         inner = space.encode_fourier(position_m) - z
     else:
-        turn = module_pull(z, space.grid_modules)
+        turn = module_pull(z, cast(Tensor, space.grid_modules))
         inner = torch.polar(torch.ones_like(turn), turn) * z - z
     inner = config.coupling_gain * inner
     return inner if pull is None else pull + inner
@@ -103,6 +104,11 @@ class Packet(BufferModule):
 
     position_m: Tensor
     age: Tensor
+
+    @property
+    def z(self) -> Tensor:
+        """Fourier coefficients that the oscillators hold, complex, ``(batch, n_frequencies)``."""
+        raise NotImplementedError
 
     def __init__(
         self, space: SSPSpace, config: PathIntegratorConfig, time_step_s: float, batch: int

@@ -1,5 +1,7 @@
 """Grid, place and object-vector cells: neurons whose encoders are spatial semantic pointers."""
 
+from typing import cast
+
 import torch
 from torch import Tensor
 
@@ -121,7 +123,7 @@ class VectorPopulation(BufferModule):
         """Make grid cells: each is tuned to the waves of one module; arguments as of the others."""
         draw = torch.Generator().manual_seed(seed)
         region = space.bounds_m.to(torch.get_default_dtype())
-        modules = space.grid_modules
+        modules = cast(Tensor, space.grid_modules)
         full = space.encode_fourier(_uniform(region, neurons, draw)).detach()
         own = torch.zeros(full.shape, dtype=torch.bool)
         own.scatter_(1, modules[torch.arange(neurons) % len(modules)], True)

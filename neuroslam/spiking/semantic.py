@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
 import torch
@@ -116,7 +116,7 @@ class SemanticCells(Population):
     ) -> None:
         super().__init__()
         self.config = config
-        self.follows = follows
+        self.follows: Follows = follows
         self.detector: MarkerDetector | None = None  # of markers in images
         self._update: LandmarkUpdate | None = None  # of the last frame
         self.known = Vocabulary()
@@ -276,8 +276,8 @@ class SemanticCells(Population):
     @property
     def rates(self) -> np.ndarray:
         """Real, then imaginary part of each oscillator of the path integrator."""
-        z = self.slam.integrator.z.flatten().numpy(force=True)
-        return np.concatenate([z.real, z.imag])
+        z = self.slam.integrator.z.flatten()
+        return np.concatenate([z.real.numpy(force=True), z.imag.numpy(force=True)])
 
     def counts(self) -> dict[str, float]:
         """Return the number of confirmed landmarks."""
@@ -538,10 +538,10 @@ class SemanticCells(Population):
         velocity = torch.tensor(step_m) / (steps * dt)
         result = slam.run(velocity.expand(steps, 1, 2), view, self.watch)
         recall, gate, lost, attended = (
-            part[-1, 0].item()
-            for part in (result.recall, result.gate, result.lost, result.attended)
+            part[-1, 0] for part in (result.recall, result.gate, result.lost, result.attended)
         )
-        return attended, recall, gate, lost and bool(slam.familiar[0])
+        known = bool(lost) and bool(slam.familiar[0])
+        return int(attended), float(recall), float(gate), known
 
     def _note_place(self, row: int, belief: Belief | None, seen_m: np.ndarray) -> None:
         """Decode the recalled position of a landmark into ``known``."""
@@ -558,7 +558,7 @@ class SemanticCells(Population):
         place = place[0].double()
         anchor = int(self.known["experience"][row])
         if anchor >= 0 and self.follows == "map":
-            at = belief.poses[anchor]
+            at = cast(Belief, belief).poses[anchor]
             self.known["offset_m"][row] = torch.from_numpy(into_frame(at, place.numpy()))
         self.known["place_m"][row] = place
 

@@ -1,7 +1,7 @@
 """Merge of the landmarks of two sessions."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ class LandmarkCells(Protocol):
     """What a merge uses of :class:`~neuroslam.spiking.semantic.SemanticCells`."""
 
     config: SemanticConfig
-    follows: str
+    follows: Literal["nothing", "map", "cells"]
     known: Vocabulary
     words: WordTable
     slam: SSPSLAM
@@ -29,9 +29,11 @@ class LandmarkCells(Protocol):
     @property
     def pose(self) -> Pose:
         """Pose of the robot."""
+        ...
 
     def moved(self, points_m: np.ndarray, join: Join) -> np.ndarray:
         """Move positions of the partial session into the loaded frame."""
+        ...
 
     def write_memory(self) -> None:
         """Rewrite the memory from ``known``."""
@@ -41,6 +43,7 @@ class LandmarkCells(Protocol):
 
     def state_dict(self) -> State:
         """Return the state."""
+        ...
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """SSP-SLAM: path integration by oscillators, corrected by an associative map of landmarks."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -196,7 +196,7 @@ class SSPSLAM(BufferModule):
     @property
     def n_neurons(self) -> int:
         """Number of neurons of one animal, in all populations."""
-        return sum(part.n_neurons for part in self.parts.values())
+        return sum(cast(int, part.n_neurons) for part in self.parts.values())
 
     @property
     def parts(self) -> dict[str, nn.Module]:

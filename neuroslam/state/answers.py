@@ -5,13 +5,17 @@ answer by NumPy's or torch's numbers, and a wrong answer is told by the name of 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
+from typing import TypeVar
 
 import numpy as np
 from torch import Tensor
 
+from neuroslam.errors import ConfigError
 from neuroslam.state.population import Correction, Picture, Population
+
+Answer = TypeVar("Answer")
 
 RUN_TABLES = ("frames.csv", "experiences.csv", "links.csv")
 """Tables that every run writes: a population's must be called otherwise."""
@@ -23,6 +27,13 @@ RUN_FIGURES = (
     "tables", "interrupted", "ate_rmse_m", "odometry_ate_rmse_m",
 )  # fmt: skip
 """Figures that every run has: a population's counts must be called otherwise."""
+
+RUN_TAGS = (
+    "view/templates", "view/match_error", "view/frame_and_template", "map/experiences", "map/links",
+    "map/largest_correction", "map/experiences_and_links", "run/frames_per_s", "cells/place_map",
+    "cells/boundary_response", "cells/grid_rate_maps",
+)  # fmt: skip
+"""Tags of TensorBoard that a run writes itself: a population's must be called otherwise."""
 
 
 def counts_of(population: Population) -> dict[str, float]:
@@ -41,16 +52,19 @@ def scalars_of(population: Population) -> dict[str, float]:
     """Return a population's curves now, as plain numbers by tag.
 
     Raises:
-        TypeError: If it is anything else.
+        TypeError: If it is anything else, or a tag is one of :data:`RUN_TAGS`.
     """
-    return _numbers(population, "scalars", population.scalars())
+    scalars = _numbers(population, "scalars", population.scalars())
+    _refuse_tags(population, "scalars", scalars)
+    return scalars
 
 
 def pictures_of(population: Population) -> dict[str, Picture]:
     """Return a population's pictures as arrays by tag; those that have no pixel are left out.
 
     Raises:
-        TypeError: If one is no array, ``(h, w)`` or ``(h, w, 3)``, nor a tuple of the former.
+        TypeError: If one is no array, ``(h, w)`` or ``(h, w, 3)``, nor a tuple of the former; or a
+            tag is one of :data:`RUN_TAGS`.
     """
     pictures: dict[str, Picture] = {}
     for tag, picture in _named(population, "images", population.images()).items():
@@ -67,6 +81,7 @@ def pictures_of(population: Population) -> dict[str, Picture]:
             )
         if layers and all(layer.size for layer in layers):
             pictures[tag] = layers if layered else layers[0]
+    _refuse_tags(population, "images", pictures)
     return pictures
 
 
@@ -79,7 +94,7 @@ def tables_of(population: Population) -> dict[str, str]:
     """
     tables: dict[str, str] = {}
     for name, text in _named(population, "tables", population.tables()).items():
-        if not re.fullmatch(r"[\w-]+\.csv", name) or name in RUN_TABLES:
+        if not re.fullmatch(r"[\w-]+\.csv", name) or name.lower() in RUN_TABLES:
             raise TypeError(
                 f"{_who(population)}.tables(): {name!r} is not a name for it; expected one like "
                 f"{population.kind}.csv"
@@ -91,6 +106,68 @@ def tables_of(population: Population) -> dict[str, str]:
             )
         tables[name] = text
     return tables
+
+
+def gathered(
+    populations: Iterable[Population], ask: Callable[[Population], Mapping[str, Answer]]
+) -> dict[str, Answer]:
+    """Return what all populations of a brain answer, by name.
+
+    Args:
+        populations: The populations.
+        ask: One of :func:`counts_of`, :func:`scalars_of`, :func:`pictures_of`, :func:`tables_of`.
+
+    Raises:
+        TypeError: If one answers what it must not, or two use the same name.
+
+    Example:
+        >>> from neuroslam.config.populations import population_class
+        >>> from neuroslam.config import BrainConfig
+        >>> pose = population_class("pose")
+        >>> cells = pose.build(BrainConfig(), pose)
+        >>> list(gathered([cells], scalars_of))
+        ['cells/peak']
+        >>> gathered([cells, cells], scalars_of)
+        Traceback (most recent call last):
+        TypeError: PoseCellNetwork and PoseCellNetwork: both name one of their scalars() ...
+    """
+    answers: dict[str, Answer] = {}
+    first: dict[str, Population] = {}
+    for population in populations:
+        for name, answer in ask(population).items():
+            key = name.lower() if ask is tables_of else name  # files on any disk
+            if key in first:
+                raise TypeError(
+                    f"{_who(first[key])} and {_who(population)}: both name one of their "
+                    f"{HOOKS[ask]}() {name!r}; rename one"
+                )
+            first[key], answers[name] = population, answer
+    return answers
+
+
+def check_names(populations: Iterable[Population]) -> None:
+    """Refuse populations that use the same name for a count, scalar, image or table.
+
+    Raises:
+        ConfigError: If two do.
+    """
+    together = list(populations)
+    for ask in HOOKS:
+        try:
+            gathered(together, ask)
+        except TypeError as error:
+            raise ConfigError(
+                f"cells = {'+'.join(one.kind for one in together)}: {error}"
+            ) from error
+
+
+HOOKS: dict[Callable[[Population], Mapping[str, object]], str] = {
+    counts_of: "counts",
+    scalars_of: "scalars",
+    pictures_of: "images",
+    tables_of: "tables",
+}
+"""The functions of this module that ask a population, and the method that each asks."""
 
 
 def moves_others(population: Population | None, correction: Correction | None) -> bool:
@@ -121,6 +198,12 @@ def _numbers(population: Population, hook: str, answer: object) -> dict[str, flo
             )
         plain[name] = int(value) if isinstance(value, bool | int) else float(value)
     return plain
+
+
+def _refuse_tags(population: Population, hook: str, tags: Iterable[str]) -> None:
+    for tag in tags:
+        if tag in RUN_TAGS or tag.startswith(("ssp/", "ssp_rate_hz/")):
+            raise TypeError(f"{_who(population)}.{hook}(): {tag!r} is a tag of every run; rename")
 
 
 def _named(population: Population, hook: str, answer: object) -> Mapping[str, object]:

@@ -9,7 +9,7 @@ from torch import nn
 from neuroslam.config import BrainConfig, Section
 from neuroslam.config.populations import HOMES, known_kinds, population_class, registered
 from neuroslam.errors import ConfigError, first_line
-from neuroslam.state.answers import counts_of, pictures_of, scalars_of, tables_of
+from neuroslam.state.answers import HOOKS
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import rule_of
 from neuroslam.state.population import Population
@@ -17,9 +17,10 @@ from neuroslam.state.population import Population
 Kind = TypeVar("Kind", bound=type[Population])
 
 BRAIN_NAMES = frozenset({
-    "about", "clock", "compass", "config", "continuity", "landmarks_m", "leader", "map", "merge",
-    "navigation", "not_joined", "odometry", "parts", "place", "populations", "pose_cells",
-    "recognition", "restore", "semantic", "sessions", "start_new_map", "store", "stored", "view",
+    "about", "clock", "compass", "config", "continuity", "half_taken", "landmarks_m", "leader",
+    "map", "merge", "navigation", "not_joined", "odometry", "parts", "place", "populations",
+    "pose_cells", "recognition", "restore", "semantic", "sessions", "start_new_map", "store",
+    "stored", "view",
 })  # fmt: skip
 """Attributes that every brain has, or that populations of the package are: no one else's name."""
 
@@ -169,8 +170,7 @@ def _check_empty(cls: type[Population]) -> None:
         raise ConfigError(
             f"{what}: merged() must return every name of the state; check {', '.join(sorted(odd))}"
         )
-    for ask in (counts_of, scalars_of, pictures_of, tables_of):
-        hook = {"pictures_of": "images"}.get(ask.__name__, ask.__name__.removesuffix("_of"))
+    for ask, hook in HOOKS.items():
         try:
             ask(one)
         except TypeError as error:

@@ -259,7 +259,7 @@ def test_two_sessions_in_one_arena_become_one_map(squares):
     assert felt[0] + felt[1] == pytest.approx(felt[2], rel=1e-5)
     n_walls = [int(b.navigation.walls.n_walls) for b in (*squares, merged)]
     assert n_walls[2] < n_walls[0] + n_walls[1]
-    assert "stretches of wall align with the other map's" in reports[0].found
+    assert "wall segments align with the other map's" in reports[0].found
     assert merged.map.residuals_m.max() < 1e-9
     graph, _ = merged.navigation.place.graph()
     away = torch.cdist(graph[:first], graph[first:])
@@ -295,7 +295,7 @@ def test_maps_of_other_arenas_are_refused_with_the_reason(squares, lived, other)
     brain, _ = lived(other)
     merged, reports = join_brains(squares[0], brain)
     assert merged is None
-    assert "stretches of wall" in reports[0].reason
+    assert "wall segments" in reports[0].reason
     assert "must" in reports[0].reason or "when the map" in reports[0].reason
 
 

@@ -12,8 +12,9 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.config.populations import registered
 from neuroslam.config.sections import OdometryConfig
-from neuroslam.errors import BadFrame, ConfigError, MapError
+from neuroslam.errors import BadFrame, ConfigError, MapError, RunError
 from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
 from neuroslam.state.population import Correction, Population
 from neuroslam.state.registry import register
@@ -284,3 +285,90 @@ def test_a_correction_may_leave_the_space_and_then_the_next_frame_is_refused(cel
     for frame in frames()[LIVED + 1 : LIVED + 3]:
         out = Bad({}, MARKS, "outside of its space", MapError)
         assert refusal(brain, frame, out) == ""
+
+
+# --- errors after the state has begun to change -----------------------------------------------
+
+
+class Faulty(Population):
+    """Raises an error in one of its methods, if it is told to."""
+
+    fails = error = None
+
+    def fail(self, hook):
+        if hook == self.fails:
+            raise self.error
+
+    def step(self, now, observation):
+        self.fail("step")
+
+    def vetoes(self, view):
+        self.fail("vetoes")
+        return False
+
+    def follow(self, correction):
+        self.fail("follow")
+
+    def learn(self, now, observation):
+        self.fail("learn")
+
+    def recall(self, now, observation, belief):
+        self.fail("recall")
+
+
+HOOKS = ["step", "vetoes", "follow", "learn", "recall"]
+
+
+@pytest.fixture
+def faulty(shove):
+    """A brain with a population that fails, and its state before the frame in which it does."""
+    register("faulty")(Faulty)
+    brain = brain_of("pose+head_direction+shove+faulty")
+    for frame in frames()[:LIVED]:
+        brain(frame)
+    before = state_of(brain)
+    brain.shove.says = Correction(0.1)  # so that there is something to follow
+    yield brain, before
+    registered.pop("faulty")
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+def test_a_bad_frame_after_check_is_an_error_of_the_program_and_breaks_the_brain(hook, faulty):
+    brain, before = faulty
+    brain.faulty.fails, brain.faulty.error = hook, BadFrame("too dark")
+    said = rf"frame {LIVED}: Faulty\.{hook}\(\) raised BadFrame \(too dark\) after the state"
+    with pytest.raises(RuntimeError, match=f"{said} had changed; refuse a frame in observe or"):
+        brain(frames()[LIVED])
+    brain.faulty.fails = brain.shove.says = None
+    whole = brain_of("pose+head_direction+shove+faulty")
+    broken = rf"frame {LIVED} is half taken: Faulty\.{hook}\(\) was interrupted by BadFrame"
+    for use in (lambda: brain(frames()[LIVED + 1]), brain.state_dict, lambda: whole.store(brain)):
+        with pytest.raises(RuntimeError, match=broken):
+            use()
+    brain.load_state_dict(before)
+    assert changed(before, brain) == []
+    whole.load_state_dict(before)
+    assert brain(frames()[LIVED]) == whole(frames()[LIVED])
+
+
+@pytest.mark.parametrize("error", [ValueError("no such cell"), MapError("out"), KeyboardInterrupt])
+def test_any_other_error_stays_what_it_is_and_breaks_the_brain(error, faulty):
+    brain, _ = faulty
+    brain.faulty.fails, brain.faulty.error = "learn", error
+    with pytest.raises(error if isinstance(error, type) else type(error)):
+        brain(frames()[LIVED])
+    assert "Faulty.learn() was interrupted by" in brain.half_taken
+
+
+def test_a_run_does_not_write_a_map_of_a_frame_half_taken(faulty, tmp_path, monkeypatch):
+    def learn(self, now, observation):
+        if now.frame == 3:
+            raise MapError("no such cell")
+
+    monkeypatch.setattr(Faulty, "learn", learn)
+    config = build_config({"cells": "pose+faulty"})
+    world = "world:corridor?width=64&height=40&frames_per_lap=150"
+    said = r"no such cell; the map is not written: frame 3 is half taken: Faulty\.learn\(\)"
+    with pytest.raises(RunError, match=said):
+        run(world, tmp_path / "out", config, tensorboard=False)
+    assert not (tmp_path / "out" / "brain.safetensors").exists()

@@ -194,7 +194,7 @@ def test_animals_of_a_batch_are_as_if_alone():
             torch.testing.assert_close(together.activity[row], cells.activity)
 
 
-def test_who_leaves_the_wall_is_as_at_rest():
+def test_activity_decays_to_rest_away_from_a_wall():
     cells, rested = BoundaryCells(CONFIG), BoundaryCells(CONFIG)
     for one in (cells, rested):
         one(torch.tensor([0.05]), torch.tensor([0.0]), 1.0)

@@ -277,7 +277,7 @@ def test_the_same_seed_grows_the_same_network_and_another_one_another():
     assert torch.equal(grown_anew(configs[0]).feedforward, first.feedforward)
 
 
-def test_who_develops_as_another_did_is_its_equal_and_apart_from_it():
+def test_two_networks_developed_alike_are_equal_and_independent():
     config = GridCellConfig(development_steps=50)
     first = grown_anew(config)
     before = {name: value.clone() for name, value in first.state_dict().items()}

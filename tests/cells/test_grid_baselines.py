@@ -104,7 +104,7 @@ def test_there_and_back_returns_the_rates_of_interference(path):
     torch.testing.assert_close(cells.rates, start, atol=1e-9, rtol=0)
 
 
-def test_oscillators_gain_on_theta_by_the_way_along_their_direction():
+def test_oscillator_phases_advance_by_the_distance_along_their_direction():
     cells = OscillatoryInterference([0.5], orientations_rad=[0.0])
     for _ in range(8):
         cells(torch.tensor([0.0, 0.1]), 0.05)  # 4 cm along the second wave vector
@@ -233,7 +233,7 @@ def test_a_sheet_is_back_where_it_was_after_one_spacing_along_its_axis():
     assert moved.norm() < 0.01
 
 
-def test_activity_of_a_sheet_is_bounded_and_who_is_too_fast_is_followed_too_slowly():
+def test_activity_of_a_sheet_is_bounded_and_it_lags_above_its_top_speed():
     sheet = GridSheet(0.3)
     start = sheet.sheet.sum().item()
     assert 2.0 < sheet.fastest_m_s < 5.0

@@ -405,7 +405,7 @@ def test_a_correction_of_others_turns_the_heading_by_it_and_no_memory(turn):
     assert cells.views["heading_rad"].tolist() == pytest.approx([0.0], abs=1e-6)
 
 
-def test_views_of_another_life_are_refused():
+def test_views_of_another_session_are_refused():
     cells = HeadDirectionCells()
     with pytest.raises(MapError, match="new view 3, expected 0"):
         cells.update_from_view(new(3), DT)
@@ -475,7 +475,7 @@ def a_life(config=None, views=12, seed=0, start=0.0):
     return cells
 
 
-def test_a_life_that_is_saved_and_loaded_goes_on_bit_for_bit():
+def test_a_saved_and_loaded_population_continues_bit_for_bit():
     cells, rng = a_life(), np.random.default_rng(1)
     copy = HeadDirectionCells()
     copy.load_state_dict({name: value.clone() for name, value in cells.state_dict().items()})
@@ -537,7 +537,7 @@ def test_merging_turns_the_bump_and_the_headings_and_joins_the_views(turn, share
     assert all(torch.equal(before[name], value) for name, value in partial.state_dict().items())
 
 
-def test_merging_with_an_empty_life_changes_nothing_that_was_learnt():
+def test_merging_with_an_empty_session_keeps_what_was_learnt():
     life, empty = a_life().state_dict(), HeadDirectionCells().state_dict()
     onto_empty = HeadDirectionCells().merged(empty, life, join_of(np.arange(12), 0))
     assert all(torch.equal(onto_empty[name], value) for name, value in life.items())
@@ -545,7 +545,7 @@ def test_merging_with_an_empty_life_changes_nothing_that_was_learnt():
     assert torch.equal(with_empty["views.heading_rad"], life["views.heading_rad"])
 
 
-def test_two_lives_with_a_compass_have_one_frame_already():
+def test_two_sessions_with_a_compass_share_one_frame():
     lives = [a_life(seed=seed) for seed in (0, 1)]
     for life, heading in zip(lives, (0.5, -2.0), strict=True):
         life.advance(Motion(0.0, 0.0, DT), CompassReading(heading))
@@ -555,7 +555,7 @@ def test_two_lives_with_a_compass_have_one_frame_already():
     assert torch.equal(merged["activity"], partial["activity"])
 
 
-def test_a_life_without_compass_comes_into_the_frame_of_one_with_it():
+def test_a_session_without_compass_is_turned_into_the_frame_of_one_with_it():
     loaded, partial = a_life(views=2), a_life(views=2)
     partial.advance(Motion(0.0, 0.0, DT), CompassReading(2.0))
     join = join_of([0, 1], 2)
@@ -593,7 +593,7 @@ def test_faults_of_a_state_are_told():
         assert said in fault
 
 
-def test_what_is_told_of_the_cells_is_what_they_are():
+def test_counts_scalars_and_images_describe_the_cells():
     cells = a_life()
     assert cells.counts() == {"head_direction_cells": 120, "head_direction_views": 12}
     assert cells.scalars()["head_direction/heading_rad"] == pytest.approx(cells.heading_rad)

@@ -75,7 +75,7 @@ def assert_same(ours, theirs):
 
 
 @pytest.mark.parametrize("arena", ["triangle", "pillar"])
-def test_who_errs_in_nothing_knows_its_place_exactly_and_is_never_lost(arena):
+def test_without_errors_the_position_is_exact_and_never_lost(arena):
     senses = sense(walk_in(arena, 1.5))
     cells = NavigationCells(CONFIG)
     positions, corrections, places, recruited, lost = live(cells, senses)
@@ -104,7 +104,7 @@ def test_with_noise_the_walls_keep_it_nearer_than_self_motion_alone():
     torch.testing.assert_close(positions, alone[:, :200], rtol=0, atol=1e-9)
 
 
-def test_a_life_is_the_same_each_time_it_is_lived():
+def test_two_runs_of_the_same_session_are_equal():
     senses = sense(walk_in("circle1m", 0.5), SenseNoise(), [3])
     first, again = NavigationCells(CONFIG), NavigationCells(CONFIG)
     torch.manual_seed(0)
@@ -117,7 +117,7 @@ def test_a_life_is_the_same_each_time_it_is_lived():
 
 @pytest.mark.parametrize("batch", [None, 3])
 @pytest.mark.parametrize("cut", [1, 153])
-def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(batch, cut):
+def test_saved_and_loaded_cells_continue_bit_for_bit(batch, cut):
     senses = sense(walk_in("triangle", 0.5), SenseNoise(), range(batch or 1))
     whole, first, second = (NavigationCells(CONFIG, batch) for _ in range(3))
     said = live(whole, senses)
@@ -129,7 +129,7 @@ def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(batch, cut):
     assert_same(whole.state_dict(), second.state_dict())
 
 
-def test_animals_of_a_batch_that_live_the_same_life_are_one_animal():
+def test_animals_of_a_batch_with_the_same_input_are_equal():
     senses = sense(walk_in("triangle", 0.5), SenseNoise(), [4])
     together = live(NavigationCells(CONFIG, batch=3), rows_of(senses, senses, senses))
     alone = live(NavigationCells(CONFIG), senses)
@@ -152,7 +152,7 @@ def test_animals_of_a_batch_that_see_walls_at_the_same_times_are_as_if_alone():
         assert abs(int(cells.place.n_cells[row] - single.place.n_cells[0])) <= 4
 
 
-def test_animals_on_their_own_ways_stay_close_to_what_each_is_alone():
+def test_animals_of_a_batch_on_different_paths_stay_close_to_each_alone():
     senses = rows_of(
         *(sense(walk_in("triangle", 0.4, seed), SenseNoise(), [seed]) for seed in range(3))
     )
@@ -221,7 +221,7 @@ def test_a_frame_that_cannot_be_is_refused_and_changes_nothing():
 # Frames
 
 
-def test_frames_are_lived_as_steps_are_and_walls_may_come_in_any_order():
+def test_frames_equal_steps_and_walls_may_come_in_any_order():
     senses = sense(walk_in("triangle", 0.6), SenseNoise(), [2])
     steps, frames = NavigationCells(CONFIG), NavigationCells(CONFIG)
     expected = live(steps, senses)[0]
@@ -255,7 +255,7 @@ def walked(cells, metres, heading=0.0):
 
 
 @torch.inference_mode()
-def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
+def test_a_near_view_corrects_a_little_and_a_single_far_view_corrects_nothing():
     cells = NavigationCells(CONFIG)
     cells.update_from_view(view(0, is_new=True))
     walked(cells, 0.5)
@@ -272,7 +272,7 @@ def test_a_known_view_corrects_a_little_and_one_view_from_afar_moves_nobody():
 
 
 @torch.inference_mode()
-def test_views_that_agree_carry_the_animal_to_where_they_were_learnt():
+def test_agreeing_views_relocalise_the_animal_where_they_were_learnt():
     cells = NavigationCells(CONFIG)
     for number in range(8):
         cells.update_from_view(view(number, is_new=True))
@@ -286,7 +286,7 @@ def test_views_that_agree_carry_the_animal_to_where_they_were_learnt():
     )
 
 
-def test_who_is_set_to_a_place_forgets_doubt_and_keeps_what_it_knows():
+def test_relocalising_clears_doubt_and_keeps_what_was_learnt():
     cells = NavigationCells(CONFIG)
     live(cells, sense(walk_in("triangle", 1.0), SenseNoise()))
     n_cells, n_walls = cells.place.n_cells.clone(), cells.walls.n_walls.clone()
@@ -326,7 +326,7 @@ def carried(arena, n, before_min=4.0, after_min=1.0, far_m=0.5):
     return rows_of(*several), cut
 
 
-def test_most_who_are_carried_notice_and_who_is_lost_learns_nothing():
+def test_most_kidnapped_animals_notice_and_lost_ones_learn_nothing():
     several, (cut, _) = zip(*(carried(arena, 6) for arena in ("triangle", "circle1m")), strict=True)
     senses, n = rows_of(*several), 12
     cells = NavigationCells(CONFIG, batch=n)
@@ -350,7 +350,7 @@ def test_most_who_are_carried_notice_and_who_is_lost_learns_nothing():
     assert (noticed <= 60.0).float().mean() >= 0.7
 
 
-def test_nobody_who_walks_for_ten_minutes_is_taken_for_lost():
+def test_no_animal_is_reported_lost_in_ten_minutes_of_walking():
     arenas = ("triangle", "circle1m", "circle2m", "square", "pillar")
     senses = rows_of(
         *(sense(walk_in(name, 10.0, 7), SenseNoise(), [k]) for k, name in enumerate(arenas))
@@ -411,7 +411,7 @@ def test_a_place_that_is_new_is_not_doubted_and_nor_is_a_wall_as_ever():
     assert familiarity.time_s[0, [0, 700]].tolist() == [60.0, 60.0]
 
 
-def test_who_is_told_where_it_is_doubts_no_more():
+def test_relocalising_resets_familiarity_doubt():
     familiarity = Familiarity(FELT, lost_after_s=2.0)
     feel(familiarity, 0, math.inf, 0.0, 10.0)
     assert feel(familiarity, 0, 0.05, 0.0, 5.0)

@@ -169,7 +169,7 @@ def test_responses_of_all_cells_peak_at_the_winner_and_at_one_where_it_was_recru
     assert (alone >= every - 1e-6).all()  # continuity only takes away
 
 
-def test_who_does_not_learn_only_responds(patterns):
+def test_without_learning_cells_only_respond(patterns):
     walk = strides("triangle", 6, seed=6)
     grid = patterns(walk)
     cells = new_cells()
@@ -188,7 +188,7 @@ def test_who_does_not_learn_only_responds(patterns):
     assert all(torch.equal(value, after[name]) for name, value in kept.items())
 
 
-def test_who_knows_no_place_and_may_not_learn_has_none(patterns):
+def test_without_cells_and_learning_there_is_no_winner(patterns):
     cells = new_cells()
     walk = strides("triangle", 1)[:5]
     for rates, position in zip(patterns(walk), walk, strict=True):
@@ -199,7 +199,7 @@ def test_who_knows_no_place_and_may_not_learn_has_none(patterns):
     assert cells(patterns(walk)[0], walk[0] + 1.0, 0.5).winner.item() == 0
 
 
-def test_who_stands_still_has_the_same_winner_and_learns_nothing_anew(patterns):
+def test_an_animal_at_rest_keeps_its_winner_and_recruits_no_cell(patterns):
     walk = strides("triangle", 3, seed=8)
     cells = new_cells()
     for rates, position in zip(patterns(walk), walk, strict=True):
@@ -229,7 +229,7 @@ def test_animals_of_a_batch_that_do_the_same_have_the_same_cells(patterns):
             torch.testing.assert_close(several[name][row], single[name][0])
 
 
-def test_animals_of_a_batch_that_stride_on_their_own_ways_are_as_if_alone(patterns):
+def test_animals_of_a_batch_on_different_paths_are_as_if_alone(patterns):
     walks = [strides("triangle", 6, seed=seed) for seed in (10, 11)]
     n = min(map(len, walks))
     grids = [patterns(walk) for walk in walks]
@@ -247,7 +247,7 @@ def test_animals_of_a_batch_that_stride_on_their_own_ways_are_as_if_alone(patter
 
 
 @pytest.mark.parametrize("cut", [20, 200])
-def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(patterns, cut):
+def test_saved_and_loaded_cells_continue_bit_for_bit(patterns, cut):
     walk = strides("triangle", 6, seed=12)
     grid = patterns(walk)
     whole, first, second = new_cells(), new_cells(), new_cells()
@@ -261,7 +261,7 @@ def test_who_is_saved_and_loaded_goes_on_to_the_last_bit(patterns, cut):
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-def test_a_state_read_on_the_way_does_not_change_the_way(patterns):
+def test_reading_the_state_dict_does_not_change_the_path(patterns):
     walk = strides("triangle", 3, seed=13)
     quiet, watched = new_cells(), new_cells()
     for rates, position in zip(patterns(walk), walk, strict=True):
@@ -290,7 +290,7 @@ def test_a_hebbian_step_keeps_unit_length_and_comes_nearer(seed, rate):
 
 @given(seed=seeds, power=st.floats(0.5, 80.0), sigma=st.floats(0.05, 1.0))
 @settings(max_examples=40, deadline=None)
-def test_a_response_is_a_share_that_distance_and_unlikeness_take_from(seed, power, sigma):
+def test_a_response_falls_with_distance_and_mismatch(seed, power, sigma):
     generator = torch.Generator().manual_seed(seed)
     weights = torch.nn.functional.normalize(
         torch.randn(20, 8, generator=generator, dtype=torch.float64), dim=-1

@@ -71,7 +71,7 @@ def test_gradients_flow_through_every_convolution(method):
 
 
 @pytest.mark.parametrize("cells_per_frame", [1.0, 7.0, 21.0, -3.0, 0.5, 1.5])
-def test_a_lap_of_the_torus_comes_home(cells_per_frame):
+def test_a_lap_of_the_torus_returns_to_the_start(cells_per_frame):
     start = packet_at((36, 21, 21), PoseEstimate(3.0, 5.0, 0.0))
     packet = start
     for _ in range(round(21 / abs(cells_per_frame))):
@@ -280,7 +280,7 @@ def test_the_newest_views_inject_nothing():
     assert torch.equal(cells.activity, quiet.activity)
 
 
-def test_a_view_seen_in_a_row_tires_and_recovers():
+def test_a_view_matched_in_a_row_injects_less_and_recovers():
     cells = PoseCellNetwork(PoseCellConfig(inject_after=0, active_decay=1.0, restore=0.05))
     cells(STILL, ViewMatch(0, -1.0, 0.0, True))
     cells(STILL, ViewMatch(1, -1.0, 0.0, True))

@@ -142,7 +142,7 @@ def test_the_noise_of_the_speed_told_is_that_of_the_readout():
     assert told[100:].mean() == pytest.approx(1.0, abs=4 * analytic / math.sqrt(3900))
 
 
-def test_a_seed_says_everything():
+def test_cells_are_determined_by_the_seed():
     one, same, other = (SpeedCells(SpeedCellConfig(noise_hz=2.0, seed=seed)) for seed in (3, 3, 4))
     speeds = wander(2.0, DT)
     assert np.array_equal(run(one, speeds)[1], run(same, speeds)[1])

@@ -121,7 +121,7 @@ def test_a_round_wall_agrees_with_the_memory_of_it_from_within_and_from_around(a
 
 @given(first=places, then=places, bearing=angles, more=st.floats(-0.1, 0.1), turn=angles)
 @settings(max_examples=60, deadline=None)
-def test_what_a_wall_tells_does_not_depend_on_where_the_world_lies(
+def test_a_wall_correction_does_not_depend_on_the_origin_of_the_world(
     first, then, bearing, more, turn
 ):
     c, s = math.cos(turn), math.sin(turn)
@@ -203,7 +203,7 @@ def test_a_wall_far_beyond_all_errors_is_another_and_corrects_nothing():
     assert memory.update_from_walls(at, tensor([0.9]), tensor([0.0])).tolist() == [0.0, 0.0]
 
 
-def test_a_look_too_soon_or_at_nothing_tells_nothing():
+def test_walls_sensed_too_soon_or_none_correct_nothing():
     memory, at = memory_of_one_wall(0.0, (0.1, 0.0), period_s=5.0)
     assert not memory.is_due
     assert memory.update_from_walls(at, tensor([0.1]), tensor([0.0])).tolist() == [0.0, 0.0]
@@ -213,7 +213,7 @@ def test_a_look_too_soon_or_at_nothing_tells_nothing():
     assert memory.update_from_walls(at, torch.empty(0), torch.empty(0)).tolist() == [0.0, 0.0]
 
 
-def test_who_may_not_learn_remembers_no_wall():
+def test_without_learning_no_wall_is_remembered():
     memory = WallMemory(WallMemoryConfig(), batch=2)
     memory.move(torch.zeros(2), torch.zeros(2), 1.0)
     at, wall = torch.zeros(2, 2), torch.tensor([[0.1], [0.1]])
@@ -241,7 +241,7 @@ def test_learnt_errors_are_taken_off_the_motion():
 
 @given(seen=places, sigma=st.floats(0.01, 1.0))
 @settings(max_examples=30, deadline=None)
-def test_a_position_that_is_told_draws_by_the_share_of_the_variances(seen, sigma):
+def test_a_given_position_corrects_by_the_ratio_of_variances(seen, sigma):
     memory, twin = (WallMemory(WallMemoryConfig(**ALIKE)) for _ in range(2))
     at = memory.move(tensor(1.0), tensor(0.3), 1.0)
     twin.observe_position(at, at, 1e6 * twin.move(tensor(1.0), tensor(0.3), 1.0).norm().item())
@@ -268,7 +268,7 @@ def test_the_belief_spreads_alike_at_any_rate_of_samples(way, n):
     torch.testing.assert_close(spreads[1], spreads[0], rtol=1e-6, atol=1e-12)
 
 
-def test_what_was_long_known_speaks_against_the_place_when_it_is_missing_and_for_it_when_not():
+def test_missing_known_walls_contradict_the_position_and_present_ones_support_it():
     memory, wall = WallMemory(WallMemoryConfig()), tensor([0.05])
     at, east, nothing = torch.zeros(2, dtype=torch.float64), tensor([0.0]), tensor([math.inf])
     assert [bool(e) for e in memory.evidence(at[None], nothing[None], east[None], 0.18)] == [
@@ -284,7 +284,7 @@ def test_what_was_long_known_speaks_against_the_place_when_it_is_missing_and_for
     assert (against.item(), supports.item()) == (True, False)
 
 
-def test_who_forgets_the_position_keeps_the_walls_and_what_was_learnt():
+def test_forgetting_the_position_keeps_walls_and_learnt_errors():
     path = Path(senses_in("triangle", 1.0, SenseNoise()))
     memory = path.memory
     walls, errors = memory.walls.clone(), memory.errors.clone()
@@ -306,7 +306,7 @@ def test_who_forgets_the_position_keeps_the_walls_and_what_was_learnt():
     "arena",
     ["triangle", "nonagon", "circle1m", "circle2m", "pillar", "two_rooms"],
 )
-def test_who_moves_and_senses_without_error_is_not_corrected(arena):
+def test_error_free_motion_and_walls_cause_no_correction(arena):
     path = Path(senses_in(arena, 2.0))
     assert path.memory.n_walls.item() > 5
     assert np.abs(path.corrections).max() < 1e-6
@@ -375,7 +375,7 @@ def test_more_walls_than_active_ones_still_keep_the_position():
 
 
 @pytest.mark.parametrize("turn", [0.7, -2.9, math.pi])
-def test_a_turned_world_is_walked_in_alike(turn):
+def test_rotating_the_world_rotates_the_estimates(turn):
     senses = senses_in("triangle", 2.0, SenseNoise(), seeds=(0, 5))
     as_it_is = Path(senses)
     turned = Path(senses, headings=wrap(torch.from_numpy(senses.heading_rad + turn)).numpy())
@@ -386,7 +386,7 @@ def test_a_turned_world_is_walked_in_alike(turn):
     torch.testing.assert_close(turned.memory.errors, as_it_is.memory.errors, rtol=0, atol=1e-9)
 
 
-def test_a_shifted_world_is_corrected_alike():
+def test_shifting_the_world_keeps_the_corrections():
     senses = senses_in("circle1m", 1.5, SenseNoise())
     here, there = (WallMemory(WallMemoryConfig()) for _ in range(2))
     shift, at = tensor([40.0, -9.0]), torch.zeros(2, dtype=torch.float64)

@@ -37,6 +37,7 @@ def test_every_preset_is_a_config_and_survives_toml(name):
 
 def test_presets_exist_for_the_published_data():
     wanted = {"openratslam", "irat", "new_college", "lab_tour", "virtual_tour", "rc_car"}
+    wanted |= {"multisession_2023"}
     assert wanted <= set(preset_names())
 
 

@@ -114,7 +114,7 @@ def test_a_real_drive_in_sessions_has_the_shape_of_a_single_session(name, k, sha
 def test_no_cut_of_one_drive_is_joined_to_one_of_another(shared):
     if not (shared / "data" / "usi_track1").is_dir():
         pytest.skip("no usi_track1 beside the checkout")
-    row = wrong_merges(shared / "data")
-    assert row["tries"] >= 50
+    row = wrong_merges(shared / "data", n=5)
+    assert row["tries"] == 25
     assert row["merges"] == 0
     assert all(row["reasons"])

@@ -16,7 +16,9 @@ def pictures(folder):
 
 
 def test_queries_of_a_map_are_answered_and_counted_in_random_maps(tmp_path):
-    found = ssp_map(None, tmp_path, seconds=40.0, tier="algebraic", n_random_maps=3)
+    found = ssp_map(
+        None, tmp_path, seconds=25.0, tier="algebraic", n_random_maps=4, random_seconds=40.0
+    )
     rows = {row["question"]: row for row in found["rows"]}
     assert rows["landmark, random maps"]["right"] == rows["landmark, random maps"]["landmarks"] > 10
     assert rows["attribute, random maps"]["right"] >= 2
@@ -28,7 +30,7 @@ def test_queries_of_a_map_are_answered_and_counted_in_random_maps(tmp_path):
 
 def test_localisation_is_better_with_a_map_under_noise(tmp_path):
     methods = ("algebraic", "algebraic, phase noise 0.3")
-    rows = ssp_localisation(None, tmp_path, 90.0, n_trials=3, methods=methods)["rows"]
+    rows = ssp_localisation(None, tmp_path, 60.0, n_trials=2, methods=methods)["rows"]
     assert max(row["ate_mean_m"] for row in rows if row["method"] == "algebraic") < 1e-3
     alone, same, _ = (row["ate_mean_m"] for row in rows if row["method"] == methods[1])
     assert same < alone
@@ -60,7 +62,7 @@ def test_kitti_is_dead_reckoned_in_floating_point_and_quantised(shared, tmp_path
 
 
 def test_neurons_are_recorded_along_a_rat_s_path(shared, tmp_path):
-    rows = ssp_activity(shared / "data" / "rodent", tmp_path, seconds=1.5, grid_neurons=45)["rows"]
+    rows = ssp_activity(shared / "data" / "rodent", tmp_path, seconds=1.0, grid_neurons=45)["rows"]
     assert len(rows) == 4
     assert rows[0]["ate_m"] < 0.05
     assert pictures(tmp_path) == {"spikes.png", "rasters.png", "gate.png"}

@@ -203,6 +203,33 @@ def test_the_plan_to_an_unreachable_goal_has_the_reason():
     assert "goal 7 is not in a map of 2" in graph.plan(7).reason
 
 
+def test_an_unreachable_goal_does_not_block_those_after_it():
+    graph = square_lap(loops=0)
+    apart = graph.n
+    graph.state.current = -1
+    graph.create(apart, AT, frame=apart)  # a part of the map that no link leads to
+    graph.relocalise(0)
+    for goal in (apart, 2):
+        graph.add_goal(goal)
+    assert graph.next_waypoint() == 1
+    assert [(goal, bool(plan.path)) for goal, plan in graph.plans()] == [(apart, False), (2, True)]
+    graph.relocalise(2)
+    graph._drop_finished_goals()
+    assert graph.goals["experience"].tolist() == [apart]
+    assert graph.next_waypoint() is None
+    ((_, plan),) = graph.plans()
+    assert plan.reason == f"no links lead from experience 2 to {apart}"
+
+
+def test_a_goal_passed_on_the_way_to_an_earlier_one_stays():
+    graph = square_lap(loops=0)
+    for goal in (3, 1):
+        graph.add_goal(goal)
+    graph.relocalise(1)
+    graph._drop_finished_goals()
+    assert graph.goals["experience"].tolist() == [3, 1]
+
+
 def test_distance_and_bearing_are_seen_from_the_robot():
     graph = ExperienceMap(MapConfig(initial_heading_deg=90.0))
     graph.create(0, AT, frame=0)

@@ -819,6 +819,18 @@ def test_places_that_contradict_each_other_are_refused_and_by_how_much_is_said(
     assert (frozen(first), frozen(second)) == before
 
 
+def test_the_rule_of_the_paper_accepts_links_that_do_not_fit(ellipse):
+    sessions = {"drift": 1.0, "check_residuals": False}
+    first, second = (lived(ellipse[part], BrainConfig(sessions=sessions))
+                     for part in (slice(150), slice(100, 250)))  # fmt: skip
+    found = find_match(first, second).match
+    wrong = found._replace(others=Pairs.of([(found.partial + 1, 0, 0.0, 0.01)]))
+    merged, report = first.merge(second, wrong)
+    assert report.merged
+    assert report.residual_after_m > 2.0 * report.residual_before_m
+    assert merged.map.n < first.map.n + second.map.n
+
+
 def test_an_open_arc_is_not_closed_by_one_wrong_pair(ellipse):
     """The strain of one pair spreads over all links, so that none is torn; odometry knows."""
     first, second = lived(ellipse[:150]), lived(ellipse[100:250])

@@ -1,6 +1,8 @@
 """A brain file is described for a reader, and every kind of damage to it is found and named."""
 
+import csv
 import json
+import math
 import shutil
 
 import numpy as np
@@ -99,6 +101,31 @@ def test_goals_with_and_without_a_time_are_no_faults(tmp_path):
     brain.start_new_map()
     save_brain(brain, tmp_path / "brain.safetensors")
     assert verify(tmp_path / "brain.safetensors") == []
+
+
+def test_tables_hold_the_bindings_the_goals_and_the_rates_of_a_brain(joined, tmp_path, call):
+    brain = load_brain(joined)
+    brain.map.add_goal(3)
+    save_brain(brain, tmp_path / "brain.safetensors")
+    done = call("inspect", tmp_path / "brain.safetensors", "--tables", tmp_path / "tables")
+    written = {path.name for path in (tmp_path / "tables").iterdir()}
+    assert (done.code, f"Written: {len(written)} tables" in done.out) == (0, True), done.out
+    assert "stored.0.map.experiences.csv" in written
+
+    def column(file, name):
+        with (tmp_path / "tables" / file).open(newline="") as opened:
+            return [float(row[name]) for row in csv.DictReader(opened)]
+
+    assert (
+        column("pose_cells.bindings.csv", "x") == brain.populations["pose"].bindings["x"].tolist()
+    )
+    assert column("map.goals.csv", "experience") == [3.0]
+    assert column("map.goals.csv", "until_s") == [math.inf]
+    assert column("map.experiences.csv", "pose_1") == brain.map.poses[:, 1].tolist()
+    assert sum(column("pose_cells.rates.csv", "rate")) == pytest.approx(1.0, abs=1e-5)
+    assert "pixels" not in (tmp_path / "tables" / "view.templates.csv").read_text()
+    refused = call("inspect", joined, "--tables", joined)
+    assert (refused.code, "is a file; expected a folder" in refused.err) == (2, True)
 
 
 def test_the_table_of_a_brain_lists_its_content(joined):

@@ -83,7 +83,7 @@ def test_inhibited_neurons_are_silent_and_come_back():
 
 
 @pytest.mark.parametrize("model", ["lif", "stepped_lif", "lif_rate", "relu"])
-def test_a_population_says_its_vector(model):
+def test_a_population_decodes_its_vector(model):
     config = NeuronConfig(model=model)
     draw = torch.Generator().manual_seed(0)
     tuning = sample_tuning(2, 300, 2, config, draw)

@@ -120,7 +120,7 @@ def double():
 
 
 @pytest.mark.usefixtures("double")  # in single precision a rounding can move a spike
-def test_animals_of_a_batch_live_as_alone():
+def test_animals_of_a_batch_are_as_if_alone():
     config = SSPSLAMConfig(**TIERS["spiking"])
     worlds = [random_world(3, seed=k) for k in range(2)]
     paths = [circle(0.4, 1e-3, laps=0.1), circle(0.4, 1e-3, radius=0.5, laps=-0.1)]
@@ -195,7 +195,7 @@ def test_a_walk_is_the_same_at_two_time_steps():
 
 
 @pytest.mark.parametrize("tier", ["algebraic", "spiking"])
-def test_who_is_put_elsewhere_finds_itself_at_a_known_landmark(tier):
+def test_a_kidnapped_animal_relocalises_at_a_known_landmark(tier):
     slam = slam_in(SSPSLAMConfig(**TIERS[tier]), WORLD)
     simulate(slam, [WORLD], [circle()])
     true = np.array([0.4, 0.05])
@@ -213,7 +213,7 @@ def test_who_is_put_elsewhere_finds_itself_at_a_known_landmark(tier):
     np.testing.assert_allclose(slam.integrator.position_m[0], true + off, atol=0.03)
 
 
-def test_who_may_not_relocalise_stays_lost():
+def test_without_relocalisation_the_animal_stays_lost():
     config = SSPSLAMConfig(**VECTORS, relocalise_after_s=0.0)
     slam = slam_in(config, WORLD)
     simulate(slam, [WORLD], [circle()])
@@ -245,7 +245,7 @@ def two_sessions(tier, offset, names=("ABC", "BCD")):
 
 
 @pytest.mark.parametrize("tier", ["algebraic", "spiking"])
-def test_two_maps_are_laid_on_each_other_by_what_both_know(tier):
+def test_two_maps_are_aligned_by_landmarks_that_both_know(tier):
     at, (loaded, partial) = two_sessions(tier, (0.2, -0.1))
     before = [{k: v.clone() for k, v in m.state_dict().items()} for m in (loaded, partial)]
     merged, report = merge_semantic_maps(loaded, partial)
@@ -326,7 +326,7 @@ def test_questions_to_a_map_of_attributes_and_walls():
     np.testing.assert_allclose(there, truth[0] - stops[-1], atol=0.02)
 
 
-def test_neighbours_are_told_apart():
+def test_near_landmarks_are_distinguished():
     space = SSPSpace.hexagonal(n_rotations=5, n_scales=5)
     at = torch.tensor([[0.3, 0.2], [0.36, 0.24], [-0.5, 0.0]])
     found = queries.places_in(space, space.encode_fourier(at).sum(0)).position_m

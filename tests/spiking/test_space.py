@@ -67,7 +67,7 @@ def test_waves_of_odd_numbers_of_orientations_are_those_of_the_reference(oracle,
 @pytest.mark.parametrize("dimension", [1, 2, 3, 4])
 @pytest.mark.parametrize("n_rotations", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("make", [SSPSpace.hexagonal, SSPSpace.rectangular])
-def test_no_wave_is_there_twice(make, dimension, n_rotations):
+def test_all_waves_differ(make, dimension, n_rotations):
     space = make(dimension, n_rotations if dimension > 1 else 1, 3)
     w = space.frequencies
     same = torch.cdist(w, w) + 9 * torch.eye(len(w))

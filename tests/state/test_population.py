@@ -4,8 +4,12 @@ import base64
 import copy
 import csv
 import math
+import os
+import pickle
+import subprocess
 import sys
 import textwrap
+from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -418,6 +422,42 @@ def test_processes_of_a_sweep_load_the_file_and_its_seed_is_varied_too(plugin, t
     assert [row["draws"] for row in rows(tmp_path / "out" / "sweep.csv")] == [
         "15", "1015", "30", "1030"
     ]  # fmt: skip
+
+
+WORKER = """
+import sys
+from neuroslam.runs.parallel import _attempt_on_ray
+print(_attempt_on_ray(sys.argv[1], bytes.fromhex(sys.argv[2])))
+"""
+
+
+def test_a_worker_of_ray_loads_the_file_before_it_reads_a_config(plugin, tmp_path):
+    """It is started by the cluster: it has nothing of this process's environment."""
+    populations.load_plugin(plugin)
+    call = pickle.dumps((str, BrainConfig(cells="pose+draws", draws={"step": 7}).section("draws")))
+    here = {k: v for k, v in os.environ.items() if k != populations.PLUGINS}
+    said = {}
+    for file in (plugin, tmp_path / "nowhere.py"):
+        done = subprocess.run(
+            [sys.executable, "-c", WORKER, str(file), call.hex()],
+            capture_output=True, text=True, check=False,
+            env=here | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        said[file.name] = done.stdout.strip()
+    assert said["draws.py"] == "seed=0 step=7"
+    assert "nowhere.py: no such file; expected a Python file" in said["nowhere.py"]
+
+
+def test_run_and_sweep_print_what_the_population_counts(plugin, call, tmp_path):
+    options = ("--set", "cells=pose+draws", "--stop", 5, "--plugin", plugin)
+    done = call("run", WORLD, *options, "--no-tensorboard", "--out", tmp_path / "run")
+    assert "\ndraws 5\n" in done.out
+    done = call("sweep", WORLD, *options, "--vary", "draws.step=1,2", "--out", tmp_path / "sweep")
+    table = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines()]
+    assert [row[-1] for row in table if row] == ["5", "10"] or [
+        row[-2] for row in table if row
+    ] == ["5", "10"]
 
 
 def test_without_its_file_a_run_and_a_brain_say_how_to_give_it(plugin, call, mistake, tmp_path):

@@ -18,7 +18,9 @@ from neuroslam.runs.results import RunSummary
 from neuroslam.state.answers import (
     RUN_FIGURES,
     RUN_TABLES,
+    check_names,
     counts_of,
+    gathered,
     pictures_of,
     scalars_of,
     tables_of,
@@ -282,6 +284,88 @@ def test_every_attribute_of_a_brain_is_kept_from_being_a_name():
 def test_every_figure_and_table_of_a_run_is_kept_from_being_a_populations():
     assert set(RunSummary().to_dict()) <= set(RUN_FIGURES)
     assert {name for name in RUN_FILES if name.endswith(".csv")} == set(RUN_TABLES)
+
+
+class Loud(Sum):
+    """Uses one name for each kind of answer, as another does."""
+
+    def counts(self):
+        return {"visits": 1}
+
+    def scalars(self):
+        return {"cells/visits": 1.0}
+
+    def images(self):
+        return {"cells/visits": np.ones((2, 2))}
+
+    def tables(self):
+        return {"visits.csv": "a\n"}
+
+
+def only(hook, **more):
+    """A population that gives one of these answers, or others."""
+    members = {hook: getattr(Loud, hook)}
+    return type("Quiet", (Sum,), members | {k: lambda _self, v=v: v for k, v in more.items()})
+
+
+@pytest.mark.parametrize("hook", ["counts", "scalars", "images", "tables"])
+def test_two_populations_of_a_brain_cannot_use_one_name(hook):
+    register("loud")(Loud)
+    register("quiet")(only(hook))
+    NavigationBrain(BrainConfig(cells="pose+quiet"))
+    said = rf"cells = pose\+loud\+quiet: Loud and Quiet: both name one of their {hook}\(\) '"
+    with pytest.raises(ConfigError, match=said):
+        NavigationBrain(BrainConfig(cells="pose+loud+quiet"))
+
+
+@pytest.mark.parametrize(
+    ("answers", "said"),
+    [
+        ({"counts": {"place_cells": 1}}, r"NavigationCells and Quiet: both .* 'place_cells'"),
+        ({"scalars": {"cells/walls": 1.0}}, r"NavigationCells and Quiet: both .* 'cells/walls'"),
+        ({"tables": {"Landmarks.csv": "a\n"}}, r"SemanticCells and Quiet: both .*andmarks.csv'"),
+    ],
+)
+def test_nor_a_name_of_the_packages_populations(answers, said):
+    (hook,) = answers
+    register("quiet")(only(hook, **answers))
+    with pytest.raises(ConfigError, match=said):
+        NavigationBrain(BrainConfig(cells="pose+place+semantic+quiet"))
+    with pytest.raises(ConfigError, match="both name one of their"):
+        NavigationBrain(BrainConfig(cells="place+semantic+quiet"))
+
+
+def test_a_name_that_comes_with_experience_is_refused_when_it_is_asked_for():
+    class Late(Sum):
+        def counts(self):
+            return {"place_cells": 2} if self.total else {}
+
+    register("late")(Late)
+    brain = NavigationBrain(BrainConfig(cells="place+late"))
+    brain.late.total += 1
+    with pytest.raises(TypeError, match="NavigationCells and Late: both name one of their counts"):
+        gathered(brain.populations.values(), counts_of)
+
+
+@pytest.mark.parametrize(
+    ("answers", "said"),
+    [
+        ({"counts": {"experiences": 1}}, r"Quiet.counts\(\): 'experiences' is a figure of every"),
+        ({"scalars": {"map/links": 1}}, r"Quiet.scalars\(\): 'map/links' is a tag of every run"),
+        ({"images": {"ssp/map": np.ones((2, 2))}}, r"Quiet.images\(\): 'ssp/map' is a tag of"),
+        ({"tables": {"frames.csv": "a\n"}}, r"Quiet.tables\(\): 'frames.csv' is not a name"),
+        ({"tables": {"Links.csv": "a\n"}}, r"Quiet.tables\(\): 'Links.csv' is not a name"),
+    ],
+)
+def test_names_of_the_run_itself_are_refused_at_registration(answers, said):
+    (hook,) = answers
+    with pytest.raises(ConfigError, match=said):
+        register("quiet")(only(hook, **answers))
+
+
+def test_the_packages_populations_have_names_of_their_own():
+    brain = NavigationBrain(BrainConfig(cells="+".join(populations.HOMES)))
+    check_names(brain.populations.values())
 
 
 def test_answers_may_be_of_numpy_or_torch_and_are_plain_afterwards():

@@ -284,7 +284,7 @@ def test_a_real_track_closes_from_the_defaults(shared, tmp_path, name, frames_a_
     source = shared / "data" / name / "frames.tar"
     if not source.exists():
         pytest.skip(f"no {name} beside the checkout")
-    tuning = tune(source, tmp_path / "out")
+    tuning = tune(source, tmp_path / "out", stop=1250)  # two laps and a half
     apart = np.abs(np.diff(tuning.keys[tuning.revisits.same], axis=1)) / frames_a_lap
     assert np.quantile(np.abs(apart - np.rint(apart)), 0.95) < 0.1  # whole laps
     assert tuning.after.inconsistency < 0.03
