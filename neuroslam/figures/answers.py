@@ -56,7 +56,7 @@ def plot_answer(answer: Answer, positions_m: np.ndarray, links: np.ndarray) -> F
 
 def _extent(answer: Answer, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the plane that is drawn."""
-    points = [positions_m, *([one.position_m] for one in answer.everything)]
+    points: list[Any] = [positions_m, *([one.position_m] for one in answer.everything)]
     points += [one.corners_m for one in answer.everything if one.corners_m]
     if answer.question.numbers:
         points.append(np.reshape(answer.question.numbers, (-1, 2)))
@@ -67,7 +67,7 @@ def _extent(answer: Answer, positions_m: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _draw(axes: Axes, one: Found, is_found: bool) -> None:
-    strong = {"alpha": 1.0 if is_found else 0.35}
+    strong: dict[str, Any] = {"alpha": 1.0 if is_found else 0.35}
     corners = np.array(one.corners_m)
     colour = style_of_words(one.words)["color"]
     if one.kind == "wall":

@@ -190,8 +190,8 @@ def _from_csv(text: str, path: Path) -> list[LandmarkWords]:
                 f"{path}: line {rows.line_num} has more values than columns; quote words that "
                 "hold a comma"
             )
-        values = {name: (value or "").strip() for name, value in row.items()}
-        values["corners"] = values.get("corners", "").split()  # type: ignore[assignment]
+        values: dict[str, Any] = {name: (value or "").strip() for name, value in row.items()}
+        values["corners"] = values.get("corners", "").split()
         entries.append(_entry(values, f"{path}: line {rows.line_num}"))
     return entries
 

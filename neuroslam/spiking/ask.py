@@ -209,7 +209,7 @@ def ask(
             found = _in_box(everything, asked.numbers)
             note = "" if found else "nothing is in the box"
         case "map":
-            found = everything
+            found = list(everything)
             note = "" if found else "the map knows no landmarks"
         case _:
             found, note = _described(known, asked)
@@ -276,8 +276,8 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> Contents:
             )
     entries = () if cells is None else cells.words.entries
     every = [products(entry.words) for entry in entries if entry.words]
-    words = frozenset(word for each in every for product in each for word in product)
-    return Contents(tuple(found), missing, words)
+    vocabulary = frozenset(word for each in every for product in each for word in product)
+    return Contents(tuple(found), missing, vocabulary)
 
 
 def _confirmed(cells: SemanticCells) -> list[int]:
