@@ -62,6 +62,7 @@ def inputs(tmp_path_factory):
         (home / name).write_text("\n".join(["time_s,v_m_s,w_rad_s", *rows]) + "\n")
     poses = [f"{k / 20.0} {f.truth.x_m} {f.truth.y_m} 0 0 0 {np.sin(f.truth.theta_rad / 2)} "
              f"{np.cos(f.truth.theta_rad / 2)}" for k, f in enumerate(frames)]  # fmt: skip
+    (home / "landmarks.csv").write_text("kind,number,name,words,corners\n,0,DOOR,BLUE * DOOR,\n")
     (home / "truth.tum").write_text("\n".join(poses) + "\n")
     angle = np.linspace(0.0, 20.0, 1500)
     walk = 0.5 * np.column_stack([np.cos(angle), np.sin(0.7 * angle)])

@@ -234,7 +234,10 @@ class BrainState(nn.Module):
         kept = type(self)(self.config)
         kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
+        populations = dict(self._populations)
         self._begin()
+        for kind, population in self._populations.items():
+            population.continue_from(populations[kind])
         self.odometry, self.continuity = senses
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)

@@ -20,6 +20,7 @@ from neuroslam.cli.mapping import demo_command, merge_command, resume_command, r
 from neuroslam.cli.options import with_plugins
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, say
 from neuroslam.cli.results import (
+    ask_command,
     evaluate_command,
     export_command,
     inspect_command,
@@ -78,6 +79,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "sweep": sweep_command,
     "fleet": fleet_command,
     "inspect": inspect_command,
+    "ask": ask_command,
     "verify": verify_command,
     "export": export_command,
     "demo": demo_command,

@@ -42,6 +42,12 @@ Source = Annotated[
         "world:NAME.",
     ),
 ]
+Landmarks = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Names and attributes of landmarks, walls, regions: CSV or TOML."
+    ),
+]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
 ConfigFile = Annotated[

@@ -1,12 +1,13 @@
-"""Commands on results: inspect, verify, export, evaluate, plot, report."""
+"""Commands on results: inspect, ask, verify, export, evaluate, plot, report."""
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.table import Table
 
-from neuroslam.cli.options import MapFile, RunFolder
+from neuroslam.cli.options import Landmarks, MapFile, RunFolder
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
 from neuroslam.errors import counted
@@ -33,6 +34,59 @@ def inspect_command(
     say(table)
     if tables is not None:
         say(f"Written: {counted(len(write_tables(path, tables)), 'table')} in {tables}")
+    return 0
+
+
+def ask_command(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="MAP", help="Folder of a run, brain file, or semantic map file."),
+    ],
+    question: Annotated[
+        str,
+        typer.Argument(
+            metavar="QUESTION",
+            help="'what is at X,Y', 'what is in X0,Y0,X1,Y1', 'where is NAME', 'which landmarks "
+            "are BLUE', or 'the whole map'.",
+        ),
+    ],
+    to: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE.png", help="Picture to write.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    landmarks: Landmarks = None,
+    within: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=0.0, help="Distance within which something is at X,Y."),
+    ] = None,
+) -> int:
+    """Ask a semantic map a question; the answer has words and coordinates in metres."""
+    from neuroslam.errors import RunError
+    from neuroslam.figures.style import save
+    from neuroslam.runs.ask import AskedMap
+
+    if to is not None and to.suffix.lower() != ".png":
+        raise RunError(f"{to}: expected a name that ends in .png")
+    asked = AskedMap(path, landmarks)
+    answer = asked.ask(question, within)
+    if to is not None:
+        save(asked.draw(answer), to)
+    if as_json:
+        print(json.dumps(answer.to_dict(), allow_nan=False))
+        return 0
+    if answer.found:
+        extra = {"at": ["distance (m)"], "box": ["share in box"]}.get(answer.question.form, [])
+        table = new_table("name", "x (m)", "y (m)", *extra, "kind", "words", title=question)
+        for one in answer.found:
+            number = one.share if answer.question.form == "box" else one.distance_m
+            x, y = one.position_m
+            more = [f"{number:.2f}"] if extra else []
+            table.add_row(one.name, f"{x:.2f}", f"{y:.2f}", *more, one.kind, one.words)
+        say(table)
+    if answer.note:
+        say(answer.note[:1].upper() + answer.note[1:])
+    if to is not None:
+        say(f"Written: {to}")
     return 0
 
 

@@ -31,6 +31,7 @@ EXPERIMENTS = {
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
     "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
+    "semantic-maps": ("neuroslam.experiments.semantic_maps", "semantic_maps", None),
     "ssp-map": ("neuroslam.experiments.ssp_map", "ssp_map", None),
     "ssp-activity": ("neuroslam.experiments.ssp_activity", "ssp_activity", "rodent"),
     "ssp-localisation": ("neuroslam.experiments.ssp_localisation", "ssp_localisation", None),

@@ -42,6 +42,9 @@ CONFIGS: dict[str, SSPSLAMConfig] = {
     ),
     "rate": SSPSLAMConfig(tier="rate", integrator=PathIntegratorConfig(neurons=640)),
     "spiking": SSPSLAMConfig(integrator=PathIntegratorConfig(neurons=640)),
+    "spiking, velocity in neurons": SSPSLAMConfig(
+        integrator=PathIntegratorConfig(neurons=640, velocity_neurons=500)
+    ),
     "spiking, exact binding": SSPSLAMConfig(
         binding="exact", integrator=PathIntegratorConfig(neurons=1000)
     ),

@@ -1,5 +1,6 @@
 """Figures of semantic maps: queries for landmarks and areas, vectors to landmarks, beliefs."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -51,7 +52,17 @@ class Query(NamedTuple):
 
 def style_of(landmark: Landmark) -> dict[str, Any]:
     """Return colour and marker of a landmark, from the words of its pointer."""
-    words = landmark.pointer.replace("*", " ").replace("+", " ").upper().split()
+    return style_of_words(landmark.pointer)
+
+
+def style_of_words(expression: str) -> dict[str, Any]:
+    """Return colour and marker for an expression of attributes.
+
+    Example:
+        >>> style_of_words("BLUE * SQUARE + SMALL")
+        {'marker': 's', 'color': '#0072B2'}
+    """
+    words = re.findall(r"\w+", expression.upper())
     colour = next((_COLOURS[w] for w in words if w in _COLOURS), INK)
     return {"marker": next((_MARKERS[w] for w in words if w in _MARKERS), "X"), "color": colour}
 

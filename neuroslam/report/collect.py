@@ -22,6 +22,8 @@ from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.runs.files import TIMINGS
 from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
+from neuroslam.spiking.ask import contents
+from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.state.answers import counts_of, pictures_of
 from neuroslam.state.registry import population_classes
 
@@ -96,6 +98,7 @@ def collect(run: FinishedRun) -> Facts:
         "lost": [_within(rows, span) for span in lost_spans(run)],
         "populations": populations(run.brain),
         "notes": notes,
+        **_words(run.brain),
     }  # fmt: skip
     lost_s = run.metrics.get("lost_s", 0.0)
     if lost_s and not about["lost"]:
@@ -215,6 +218,14 @@ def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:
     if (spots := brain.landmarks_m) is not None:
         arrays |= {"landmark_x_m": spots[:, 0], "landmark_y_m": spots[:, 1]}
     return arrays
+
+
+def _words(brain: NavigationBrain) -> dict[str, Any]:
+    """Return names and words of landmarks, walls and regions, if the brain has words."""
+    cells = brain.populations.get("semantic")
+    if not isinstance(cells, SemanticCells) or not cells.words.entries:
+        return {}
+    return {"words": [one.to_dict() for one in contents(cells).found]}
 
 
 def _pose_cells(cells: PoseCellNetwork) -> dict[str, np.ndarray]:

@@ -315,6 +315,20 @@ function drawLandmarks(pen, at) {
     pen.fill();
     pen.stroke();
   }
+  for (const one of about.words ?? []) drawWords(pen, at, one);
+}
+
+function drawWords(pen, at, one) {  // the name of a landmark, and the extent of a wall or region
+  pen.strokeStyle = colours.landmark;
+  pen.lineWidth = 3;
+  pen.beginPath();
+  for (const [x, y] of one.corners_m) pen.lineTo(at.sx(x), at.sy(y));
+  if (one.kind === "region") pen.closePath();
+  pen.stroke();
+  pen.fillStyle = colours.ink;
+  pen.font = "11px system-ui, sans-serif";
+  const name = one.name.toLowerCase().replaceAll("_", " ");
+  pen.fillText(name, at.sx(one.position_m[0]) + 9, at.sy(one.position_m[1]) + 4);
 }
 
 function drawWalls(pen, at) {

@@ -29,7 +29,9 @@ from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
 from neuroslam.sensors import Source, open_source
+from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
+from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -82,6 +84,7 @@ def run(
     config: BrainConfig | None = None,
     *,
     maps: Sequence[str | Path] = (),
+    landmarks: str | Path | None = None,
     preset: str = "",
     start: int = 0,
     stop: int | None = None,
@@ -100,6 +103,9 @@ def run(
         out: Folder to write; created if missing.
         config: Config of the brain; default: that of the first of ``maps``, or the default config.
         maps: Stored maps, as run folders or brain files; each is joined once it is recognised.
+        landmarks: File of names and attributes of landmarks, of walls and regions, see
+            :func:`~neuroslam.sensors.landmarks.read_landmarks`; they replace those that the source
+            has. They are stored in the brain.
         preset: Name of the preset of the config, stored with the session.
         start: First frame of the source.
         stop: Frame to stop before; default: the end.
@@ -117,11 +123,11 @@ def run(
         and ``failure`` holds the error.
 
     Raises:
-        SourceError: If the source cannot be opened.
+        SourceError: If the source cannot be opened, or the words of landmarks cannot be read.
         CheckpointError: If a stored map cannot be loaded.
         ConfigError: If a stored map was made with another config.
-        RunError: If the range holds no usable frame; or if ``out`` holds a run already and
-            ``overwrite`` is off, or cannot be written.
+        RunError: If the range holds no usable frame, or there are words and no semantic map; or if
+            ``out`` holds a run already and ``overwrite`` is off, or cannot be written.
     """
     out = Path(out)
     if start < 0 or (stop is not None and stop <= start):
@@ -133,6 +139,7 @@ def run(
         raise RunError(
             f"{out}: holds the stored map, which would be overwritten; choose another folder"
         )
+    words = () if landmarks is None else read_landmarks(landmarks)
     stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
     config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
     opened = open_source(source, config.frame_rate_hz)
@@ -142,6 +149,7 @@ def run(
         )
     brain, summary = NavigationBrain(config, features=features), RunSummary()
     brain.about = (plan.name, preset, recorded(plan.source))
+    _name_landmarks(brain, opened, words)
     for one in stored:
         brain.store(one)
     _announce(on_start, stop, opened)
@@ -162,6 +170,22 @@ def run(
             )
         summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
+
+
+def _name_landmarks(
+    brain: NavigationBrain, source: Source, words: tuple[LandmarkWords, ...]
+) -> None:
+    """Give the semantic map of a brain the words of the source, then those of a file."""
+    cells = brain.populations.get("semantic")
+    if isinstance(cells, SemanticCells):
+        for table in (source.landmark_words, words):
+            if table:
+                cells.name_landmarks(table)
+    elif words:
+        raise RunError(
+            f"--landmarks: the brain has no semantic map, its cells are "
+            f"{'+'.join(brain.config.cells)}; add semantic to them"
+        )
 
 
 def resume(

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 
 from neuroslam.errors import BadFrame
+from neuroslam.sensors.landmarks import LandmarkWords
 from neuroslam.types import Frame
 
 OnBadFrame = Callable[[BadFrame], object] | None
@@ -21,6 +22,7 @@ class Source(ABC):
         live: Whether the source is live: its frames cannot be read a second time.
         unused: Data that is in no frame, and why, one line each; complete once the source was
             read to its end.
+        landmark_words: Names and attributes of its landmarks, empty if it knows none.
     """
 
     name: str
@@ -28,6 +30,7 @@ class Source(ABC):
     frame_rate_hz: float | None
     live: bool = False
     unused: tuple[str, ...] = ()
+    landmark_words: tuple[LandmarkWords, ...] = ()
 
     @abstractmethod
     def frames(

@@ -61,6 +61,7 @@ class Streams(Source):
         self.n_frames = None
         self.frame_rate_hz = None
         self.live = camera.live or motion.live
+        self.landmark_words = motion.landmark_words or camera.landmark_words
         spans = [_span(camera, first), _span(motion, second)]
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
             raise self._no_overlap(*spans)

@@ -43,8 +43,19 @@ def match_landmarks(
     start, onto = frames
     theirs, ours = (np.array([table[key][1] for key in both]) for table in places)
     away = np.linalg.norm(move_points(ours, start, onto) - theirs, axis=1)
-    same = away <= same_m
-    ids = np.array([(places[1][key][0], places[0][key][0]) for key in both])[same]
+    ids = np.array([(places[1][key][0], places[0][key][0]) for key in both])
+    # An experience made at an outlier is not where its landmark is until it is visited again.
+    stale = [
+        np.linalg.norm(poses[ids[:, column], :2] - landmarks, axis=1) > same_m
+        for poses, column, landmarks in ((maps[1], 0, ours), (maps[0], 1, theirs))
+    ]
+    same = (away <= same_m) & ~stale[0] & ~stale[1]
+    if not same.any():
+        return None, (
+            f"{len(both)} landmarks with a name are known to both maps; none is at an experience "
+            "of both that is where the landmark is"
+        )
+    ids = ids[same]
     headings = maps[1][ids[:, 0], 2] + onto.theta_rad
     turns = wrap_angles(headings - maps[0][ids[:, 1], 2])
     pairs = Pairs(ids[:, 0], ids[:, 1], turns, away[same])

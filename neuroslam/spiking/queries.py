@@ -15,6 +15,8 @@ _LEAST_STRENGTH = 0.4  # of the remainder, above which one more position is soug
 _MOST_PLACES = 50
 _REFINEMENTS = 12
 _BOX_POINTS = 64
+_AREA_POINTS = 4096
+_AREA_RIDGE = 1e-2  # larger: edges of an area are less sharp, and less is answered beside it
 _TWO = 1.4  # strength above which a position may be two
 
 
@@ -147,9 +149,9 @@ def what(
 ) -> dict[str, float]:
     r"""Return the share of each landmark in a box; about 1 inside, 0.5 on its edge, 0 outside.
 
-    The box's vector, :math:`R = \text{mean}_{x \in D}\,\phi(x)`, is the key of the map from places
-    to pointers. A landmark in it is recalled as strongly as the memory answers alike to this key
-    and to the landmark's own place; an answer is measured by the mean of that over the box.
+    The key of the map from places to pointers is that of :func:`area_key`. A landmark in the box is
+    recalled as strongly as the memory answers alike to this key and to the landmark's own place; an
+    answer is measured by the mean of that over the box.
 
     Args:
         slam: Whose map of places learns (``places`` in its config).
@@ -168,8 +170,7 @@ def what(
             f"what: a box from {list(low_m)} to {list(high_m)}, expected a lower and an upper "
             f"corner of {slam.space.dimension} numbers each"
         )
-    vector = slam.space.from_fourier(slam.space.region_fourier(box[0], box[1])).detach()
-    key = (vector / vector.norm()).unsqueeze(0)
+    key = area_key(slam.space, box[0], box[1]).unsqueeze(0)
     share = torch.quasirandom.SobolEngine(len(box[0])).draw(_BOX_POINTS).to(box)
     inside = slam.space.encode(box[0] + (box[1] - box[0]) * share).detach()
     with torch.no_grad():
@@ -178,6 +179,45 @@ def what(
     said = slam.places.read(key)[animal, 0]
     amounts = slam.pointers @ said / slam.pointers.square().sum(-1) / alike.clamp_min(1e-6)
     return dict(zip(slam.names, amounts.tolist(), strict=True))
+
+
+@torch.no_grad()
+def area_key(space: SSPSpace, low_m: Tensor, high_m: Tensor) -> Tensor:
+    r"""Return the vector that is like the places in a box, and unlike those beside it.
+
+    The mean of the places, :math:`R = \text{mean}_{x \in D}\,\phi(x)`, is alike to its
+    surroundings as far as the similarity of places is wide. The key is the function of the space
+    that comes nearest to 1 in the box and 0 outside of it, over the bounds :math:`B`:
+
+    .. math:: k \propto (C + \lambda\,\bar c\, I)^{-1} R, \qquad
+              C = \text{mean}_{x \in B}\,\phi(x)\,\phi(x)^\top
+
+    with :math:`\bar c` the mean of the diagonal of :math:`C`.
+
+    Args:
+        space: Of the places.
+        low_m: Lower corner, ``(dimension,)``.
+        high_m: Upper corner.
+
+    Returns:
+        Of length 1, ``(n_features,)``.
+
+    Example:
+        >>> space = SSPSpace.hexagonal(n_rotations=5, n_scales=5)
+        >>> key = area_key(space, torch.tensor([-0.4, -0.4]), torch.tensor([0.4, 0.4]))
+        >>> beside = torch.tensor([[0.3, 0.0], [0.5, 0.0]])
+        >>> inside, outside = (space.encode(beside).detach() @ key).tolist()
+        >>> inside > 5.0 * abs(outside)
+        True
+    """
+    low, high = space.bounds_m.T.to(low_m)
+    at = low + (high - low) * torch.quasirandom.SobolEngine(len(low)).draw(_AREA_POINTS).to(low)
+    phi = space.encode(at).double()
+    covariance = phi.T @ phi / len(phi)
+    ridge = _AREA_RIDGE * covariance.diagonal().mean() * torch.eye(len(covariance)).to(phi)
+    region = space.from_fourier(space.region_fourier(low_m, high_m)).double()
+    key = torch.linalg.solve(covariance + ridge, region)
+    return (key / key.norm()).to(low_m)
 
 
 def vectors_to(slam: SSPSLAM, z: Tensor, animal: int = 0) -> Tensor:

@@ -1,7 +1,7 @@
 """Semantic cells of a brain: SSP-SLAM with a vocabulary of landmarks that grows."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Literal, Self, cast
 
 import numpy as np
@@ -12,6 +12,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.errors import MapError, listed
 from neuroslam.geometry import wrap_angle
+from neuroslam.sensors.landmarks import KINDS, LandmarkWords
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.landmark_frames import from_frame, into_frame, shared_frames
@@ -26,7 +27,12 @@ from neuroslam.spiking.sightings import (
     Sightings,
 )
 from neuroslam.spiking.slam import SSPSLAM, SSPStep
-from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, landmark_pointer
+from neuroslam.spiking.vocabulary import (
+    SemanticState,
+    Vocabulary,
+    WordTable,
+    landmark_pointer,
+)
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, without_gradients
@@ -46,7 +52,6 @@ from neuroslam.worlds.landmarks import LandmarkView
 Follows = Literal["nothing", "map", "cells"]
 """What semantic cells are anchored to."""
 
-_KINDS = ("landmark", "view", "nameless")
 _KNOWN = 0.5  # strength of recall above which a landmark is known
 _CLEAR = 0.7  # similarity of recall and decoded position, as a share of the strength
 _STEPS = 3  # Newton steps from the observed to the recalled position
@@ -63,7 +68,9 @@ class SemanticCells(Population):
     of a landmark follows from its kind and number, so it is the same in every session. Landmarks in
     sight are first identified, nameless ones by position; outliers among them are rejected.
 
-    State: ``known`` (:class:`~neuroslam.spiking.vocabulary.Vocabulary`), ``slam``, and ``now``.
+    State: ``known`` (:class:`~neuroslam.spiking.vocabulary.Vocabulary`), ``words``
+    (:class:`~neuroslam.spiking.vocabulary.WordTable`), ``slam``, and ``now``. Words do not change
+    what the cells learn: the pointer of a landmark is its identity.
 
     Args:
         config: Of SSP-SLAM and of what a landmark is.
@@ -113,6 +120,7 @@ class SemanticCells(Population):
         self.detector: MarkerDetector | None = None  # of markers in images
         self._update: LandmarkUpdate | None = None  # of the last frame
         self.known = Vocabulary()
+        self.words = WordTable()
         pulls = config.model_copy(update={"gain": 0.0}) if follows == "cells" else config
         self.slam = SSPSLAM(pulls, landmark_pointer(config, NAMED, 0)[None])
         self.decoder = PositionDecoder(self.slam.space)
@@ -122,7 +130,7 @@ class SemanticCells(Population):
             None  # a recorder's, called in each step
         )
         self.register_load_state_dict_pre_hook(_take_pointers)
-        self.register_load_state_dict_post_hook(lambda cells, _: cells.known.index())
+        self.register_load_state_dict_post_hook(lambda cells, _: cells._index())
 
     @property
     def n(self) -> int:
@@ -139,8 +147,46 @@ class SemanticCells(Population):
         """Return the columns of the confirmed landmarks, and their names."""
         rows = self.known.confirmed()
         columns = {c: self.known[c][rows].numpy(force=True).copy() for c in self.known.columns}
-        both = zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True)
-        return columns | {"name": np.array([f"{_KINDS[k]}_{n}" for k, n in both], dtype=str)}
+        both = list(zip(columns["kind"].tolist(), columns["number"].tolist(), strict=True))
+        return columns | {
+            "name": np.array([self.words.name_of(*key) for key in both], dtype=str),
+            "words": np.array([self.words.words_of(*key) for key in both], dtype=str),
+        }
+
+    def name_landmarks(self, table: Iterable[LandmarkWords]) -> None:
+        """Give landmarks names and attributes, and define walls and regions.
+
+        Args:
+            table: Entries; they replace those of the same number or name. Landmarks that are not
+                yet seen have their words from the first sighting on.
+
+        Raises:
+            SourceError: If an entry is invalid.
+        """
+        self.words.update(table)
+        self._know(self.slam.pointers)
+
+    def names(self) -> list[str]:
+        """Return the names of all known landmarks, also of those that are not confirmed."""
+        return [self.words.name_of(*key) for key in self.known.row_of]
+
+    def _know(self, pointers: Tensor) -> None:
+        """Set the pointers of the known landmarks, and with them their names."""
+        names = self.names() or [self.words.name_of(NAMED, 0)]  # none: there is one spare pointer
+        if len(names) != len(pointers):  # a damaged file, see faults
+            names = [str(row) for row in range(len(pointers))]
+        self.slam.know(pointers, names)
+
+    def _index(self) -> None:
+        """Update what follows from the columns of the tables."""
+        self.known.index()
+        self.words.index()
+        self._know(self.slam.pointers)
+
+    def continue_from(self, before: Population) -> None:
+        """Keep the words of landmarks on a new map."""
+        if isinstance(before, SemanticCells):
+            self.name_landmarks(before.words.entries)
 
     def observe(self, frame: Frame) -> Sightings:
         """Return the landmarks in sight: those of the source, and markers in the image.
@@ -245,14 +291,19 @@ class SemanticCells(Population):
         }
 
     def tables(self) -> dict[str, str]:
-        """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience."""
+        """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience.
+
+        A vocabulary with words adds the column ``words``.
+        """
         known = self.landmarks()
-        columns = ("name", "place_m", "seen", "first_frame", "experience")
-        rows = zip(*(known[column].tolist() for column in columns), strict=True)
-        lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e in rows]
-        return {
-            "landmarks.csv": "\n".join(["name,x_m,y_m,seen,first_frame,experience", *lines, ""])
-        }
+        columns = ("name", "place_m", "seen", "first_frame", "experience", "words")
+        rows = list(zip(*(known[column].tolist() for column in columns), strict=True))
+        lines = [f"{name},{x!r},{y!r},{n},{f},{e}" for name, (x, y), n, f, e, _ in rows]
+        header = "name,x_m,y_m,seen,first_frame,experience"
+        if self.words.entries:
+            header += ",words"
+            lines = [f"{line},{row[-1]}" for line, row in zip(lines, rows, strict=True)]
+        return {"landmarks.csv": "\n".join([header, *lines, ""])}
 
     def points_m(self) -> np.ndarray:
         """Return the positions of landmarks, ``(n, 2)``, without views."""
@@ -274,6 +325,11 @@ class SemanticCells(Population):
                 f"landmarks {listed(rows)}: met at experiences {listed(at[rows])}, "
                 f"there are {n_experiences}"
             )
+        kinds = state.get("words.kind", np.empty(0, dtype=np.int64))
+        rows = np.flatnonzero((kinds < 0) | (kinds >= len(KINDS)))
+        if len(rows):
+            most = len(KINDS) - 1
+            yield f"words {listed(rows)}: kind {listed(kinds[rows])}, expected 0 to {most}"
 
     @without_gradients
     def advance(
@@ -436,9 +492,9 @@ class SemanticCells(Population):
             experience=experience,
             offset_m=torch.from_numpy(offset),
         )
-        pointer = landmark_pointer(self.config, kind, number)[None].to(self.slam.pointers)
-        self.slam.pointers = torch.cat([self.slam.pointers[:row], pointer])
         self.known.row_of[kind, number] = row
+        pointer = landmark_pointer(self.config, kind, number)[None].to(self.slam.pointers)
+        self._know(torch.cat([self.slam.pointers[:row], pointer]))
         return row
 
     def _inliers(self, rows: np.ndarray, fresh: np.ndarray, places_m: np.ndarray) -> np.ndarray:
@@ -563,4 +619,5 @@ def _take_pointers(
     """Resize the pointers to those of a saved state."""
     saved = state.get(f"{prefix}slam.pointers")
     if saved is not None:
-        cells.slam.pointers = cells.slam.pointers.new_empty(saved.shape)
+        spare = [str(row) for row in range(len(saved))]  # named when all is loaded
+        cells.slam.know(cells.slam.pointers.new_empty(saved.shape), spare)

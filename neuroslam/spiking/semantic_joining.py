@@ -8,9 +8,9 @@ import torch
 
 from neuroslam.config.semantic import SemanticConfig
 from neuroslam.geometry import rotate_points, wrap_angle
-from neuroslam.spiking.sightings import NAMELESS, VIEW
+from neuroslam.spiking.sightings import LEAST_SEEN, NAMELESS, VIEW
 from neuroslam.spiking.slam import SSPSLAM
-from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, landmark_pointer
+from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, WordTable, landmark_pointer
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State
 from neuroslam.types import Pose
@@ -22,6 +22,7 @@ class LandmarkCells(Protocol):
     config: SemanticConfig
     follows: Literal["nothing", "map", "cells"]
     known: Vocabulary
+    words: WordTable
     slam: SSPSLAM
     now: SemanticState
 
@@ -52,7 +53,8 @@ def merge_landmarks(
     """Merge the landmarks of two sessions in the frame of the loaded one, into a new memory.
 
     Landmarks of the same name become one, views as in the merge of the maps, nameless ones by
-    position. Where the positions differ, that of the partial session, the later one, holds.
+    position. Where the positions or words differ, those of the partial session, the later one,
+    hold; but a landmark that was not seen often enough to be no outlier moves none that was.
 
     Args:
         make: Makes empty semantic cells like those that merge.
@@ -85,9 +87,14 @@ def merge_landmarks(
             continue
         mine = np.array(columns["place_m"][at])
         agree = np.linalg.norm(mine - there[row]) < one.config.same_m
-        columns["place_m"][at] = ((mine + there[row]) / 2 if agree else there[row]).tolist()
+        if agree:
+            columns["place_m"][at] = ((mine + there[row]) / 2).tolist()
+        elif theirs["seen"] >= LEAST_SEEN or columns["seen"][at] < LEAST_SEEN:
+            columns["place_m"][at] = there[row].tolist()
         columns["seen"][at] += theirs["seen"]
         columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
+    for cells in (one, other):
+        merged.words.update(cells.words.entries)
     return _written(merged, other, columns, join)
 
 
@@ -106,7 +113,8 @@ def _written(
         pointers = torch.stack(
             [landmark_pointer(merged.config, *key) for key in merged.known.row_of]
         )
-        slam.pointers = pointers.to(slam.pointers)
+        names = [merged.words.name_of(*key) for key in merged.known.row_of]
+        slam.know(pointers.to(slam.pointers), names)
         merged.write_memory()
     now = session.moved(np.array([session.pose[:2]]), join)[0]
     slam.time_s = session.slam.time_s.clone()

@@ -105,7 +105,6 @@ class SSPSLAM(BufferModule):
         self.given = config
         self.config = config = on_chip(config) if config.quantised else config
         self.batch = batch
-        self.names = tuple(names or (str(k) for k in range(len(pointers))))
         space = SSPSpace.from_config(config.space)
         c, dt, seed, n = config, config.time_step_s, config.seed, space.n_features
         if pointers.ndim != 2:
@@ -114,11 +113,8 @@ class SSPSLAM(BufferModule):
                 "features); make them with SemanticPointers"
             )
         n_key = pointers.shape[1]
-        if len(self.names) != len(pointers) or len(set(self.names)) < len(self.names):
-            raise SpaceError(
-                f"SSPSLAM: {len(self.names)} names for {len(pointers)} pointers; "
-                "give each landmark one of its own"
-            )
+        names = tuple(names or (str(k) for k in range(len(pointers))))
+        self._names = _checked_names(names, len(pointers))
         neurons = c.neurons
         if c.tier == "rate":
             neurons = neurons.model_copy(update={"model": "lif_rate"})
@@ -165,6 +161,32 @@ class SSPSLAM(BufferModule):
         self.register_buffer("contradicted_s", torch.zeros(batch))
         for name in ("recalled", "pull", "here", "there"):
             self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the landmarks, one for each pointer."""
+        return self._names
+
+    def know(self, pointers: Tensor, names: Sequence[str]) -> None:
+        """Replace the landmarks: pointers and names are only ever set together.
+
+        The memory stays: it knows landmarks by their pointers.
+
+        Args:
+            pointers: ``(landmarks, n_key)``, of the length of those before.
+            names: One for each.
+
+        Raises:
+            SpaceError: If there are not as many names as pointers, or a name occurs twice.
+        """
+        n_key = self.pointers.shape[1]
+        if pointers.ndim != 2 or pointers.shape[1] != n_key:
+            raise SpaceError(
+                f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n_key})"
+            )
+        names = _checked_names(names, len(pointers))
+        self.pointers = pointers.to(self.pointers)
+        self._names = names
 
     @property
     def space(self) -> SSPSpace:
@@ -402,3 +424,11 @@ class SSPSLAM(BufferModule):
                 f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
             )
         return position
+
+
+def _checked_names(names: Sequence[str], n: int) -> tuple[str, ...]:
+    if len(names) != n or len(set(names)) < n:
+        raise SpaceError(
+            f"SSPSLAM: {len(names)} names for {n} pointers; give each landmark one of its own"
+        )
+    return tuple(names)

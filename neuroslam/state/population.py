@@ -194,6 +194,13 @@ class Population(Mergeable):
         make = cast(Callable[..., Self], cls)  # a subclass takes its section of the config
         return make(config.section(cls.kind)) if cls.config_section else make()
 
+    def continue_from(self, before: "Population") -> None:
+        """Take over from the population of the map before what a new map of the run shares.
+
+        Args:
+            before: The population of the same kind, when a brain begins a new map.
+        """
+
     # --- a frame -------------------------------------------------------------------------------
 
     def observe(self, frame: Frame) -> Observation | None:

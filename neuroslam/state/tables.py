@@ -1,7 +1,7 @@
 """State that grows or changes every frame: tables of rows, and named numbers."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +26,8 @@ class GrowingTable(nn.Module):
 
     columns: tuple[str, ...]
     n: int
+    optional: ClassVar[bool] = False
+    """Whether an empty table has no part in a state, so that states without it can be loaded."""
 
     def __init__(self, columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]]) -> None:
         super().__init__()
@@ -87,6 +89,11 @@ class GrowingTable(nn.Module):
 def _resize_to_saved(
     module: GrowingTable, state: dict[str, Tensor], prefix: str, *_unused: object
 ) -> None:
+    if module.optional and not any(prefix + name in state for name in module.columns):
+        module.n = 0
+        for name in module.columns:
+            old = module._column(name)
+            module._buffers[name] = state[prefix + name] = old.new_empty((0, *old.shape[1:]))
     for name in module.columns:
         saved = state.get(prefix + name)
         if saved is not None:
@@ -100,7 +107,10 @@ def _keep_used_part(
     module: GrowingTable, state: dict[str, Tensor], prefix: str, _metadata: object
 ) -> None:
     for name in module.columns:
-        state[prefix + name] = state[prefix + name][: module.n]
+        if module.optional and not module.n:
+            del state[prefix + name]
+        else:
+            state[prefix + name] = state[prefix + name][: module.n]
 
 
 class Scalars(nn.Module):

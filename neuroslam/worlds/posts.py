@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from neuroslam.geometry import wrap_angles
+from neuroslam.sensors.landmarks import LandmarkWords
 from neuroslam.sensors.markers import marker_dictionary, marker_image
 from neuroslam.types import Pose
+from neuroslam.worlds.landmarks import COLOURS, SHAPES
 from neuroslam.worlds.render import cast
 from neuroslam.worlds.scene import Billboard, World
 
@@ -47,6 +49,28 @@ def with_markers(
         billboards.append(Billboard(post_x, post_y, 1.4 * size_m, height_m, len(cutouts) - 1))
     changed = replace(world, cutouts=tuple(cutouts), billboards=tuple(billboards))
     return changed, np.array(positions).reshape(-1, 2)
+
+
+def words_of_posts(n: int) -> tuple[LandmarkWords, ...]:
+    """Return name and attributes of posts: a colour and a shape, and its size.
+
+    The first 25 posts are small and have a pair of a colour and a shape each; those after them are
+    large and repeat the pairs.
+
+    Example:
+        >>> [(post.name, post.words) for post in words_of_posts(27)[::13]]
+        [('RED_SQUARE', 'RED * SQUARE + SMALL'), ('ORANGE_CIRCLE', 'ORANGE * CIRCLE + SMALL'), \
+('LARGE_BLUE_SQUARE', 'BLUE * SQUARE + LARGE')]
+    """
+    pairs = [(colour, shape) for shape in SHAPES for colour in COLOURS]
+    table = []
+    for number in range(n):
+        colour, shape = pairs[number % len(pairs)]
+        large = number >= len(pairs)
+        name = f"LARGE_{colour}_{shape}" if large else f"{colour}_{shape}"
+        words = f"{colour} * {shape} + {'LARGE' if large else 'SMALL'}"
+        table.append(LandmarkWords(name, words, number=number))
+    return tuple(table)
 
 
 def _post(dictionary: str, number: int, size_m: float, eye_m: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from neuroslam.sensors.options import parse_options
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame, Pose, Velocity
 from neuroslam.worlds.catalogue import build_world, catalogue
-from neuroslam.worlds.posts import in_sight, with_markers
+from neuroslam.worlds.posts import in_sight, with_markers, words_of_posts
 from neuroslam.worlds.render import Camera, measure_ranges, render
 from neuroslam.worlds.rodent import ornstein_uhlenbeck
 from neuroslam.worlds.scene import Billboard, World
@@ -211,6 +211,7 @@ class WorldSource(IndexedSource):
         frames_per_lap: Frames in one lap.
         noise: Noise of the odometry.
         posts_m: Positions of the posts with markers, ``(n, 2)``.
+        landmark_words: Names and attributes of the posts.
 
     Raises:
         SourceError: If there is no such world or route.
@@ -266,6 +267,7 @@ class WorldSource(IndexedSource):
             self.world, self.posts_m = with_markers(
                 world, options.markers, world.sense.camera_height_m
             )
+        self.landmark_words = words_of_posts(options.markers)
         self._headings = None
         if options.compass_deg is not None:
             normals = np.random.default_rng([options.seed, 5]).standard_normal((2, self.n_frames))

@@ -468,7 +468,7 @@ LANDMARK_DAMAGE = {
     "no row": (lambda lines: lines.pop(), " as in the brain"),
     "no value": (
         lambda lines: lines.__setitem__(1, "landmark_0,1.0\n"),
-        "cannot be read (a row has 2 values; expected 6)",
+        "cannot be read (a row has 2 values; expected 7)",
     ),
 }
 
