@@ -124,7 +124,9 @@ class BoundarySheet(nn.Module):
         self.sigmas = (c.sheet_sigma_bearing_rad * c.sheet_bearings / TWO_PI, _CELLS_PER_SIGMA)
         tuned = [(self._size(s, i), s) for i, s in enumerate(self.sigmas)]
         half = [(size, s * math.sqrt(0.5)) for size, s in tuned]
-        wide = [(self._size(_SURROUND * s, i, 3.0), _SURROUND * s) for i, s in enumerate(self.sigmas)]
+        wide = [
+            (self._size(_SURROUND * s, i, 3.0), _SURROUND * s) for i, s in enumerate(self.sigmas)
+        ]
         made = gaussian_difference(tuned, wide)
         halves = gaussian_difference(half, half).excite
         for i in range(2):
@@ -186,7 +188,7 @@ class BoundarySheet(nn.Module):
         return 2.0 * spread[..., reach:-reach]
 
     def interact(self, tuned: Tensor) -> Tensor:
-        """Do as :meth:`interact_by_convolution`, by matrices: many times faster on a small sheet."""
+        """Do as :meth:`interact_by_convolution`, by matrices: faster on a small sheet."""
         c, out = self.config, tuned
         for name, gain in (("excite", c.sheet_excitation), ("inhibit", -c.sheet_inhibition)):
             if gain:
@@ -241,9 +243,7 @@ class BoundarySheet(nn.Module):
             weight = each * (0.5 + 0.5 * np.sign(np.where(np.abs(apart) < 1e-9, 0, sign * apart)))
             for cell, part in ((0, 1.0 - share), (1, share)):
                 good = low + cell < cells
-                sides[side] += np.bincount(
-                    (flat + cell)[good], (weight * part)[good], bins * cells
-                )
+                sides[side] += np.bincount((flat + cell)[good], (weight * part)[good], bins * cells)
         return sides.reshape(2, bins, cells)
 
     def read(self, rates: Tensor, clear: float | None = None) -> tuple[Tensor, Tensor, Tensor]:
