@@ -4,6 +4,7 @@ Activity of an attractor network is compact: some hundred cells of a hundred tho
 :class:`Packet` keeps the smallest window that holds them, so a step costs the same on any torus.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Literal, NamedTuple, cast
 
@@ -50,6 +51,111 @@ def gaussian_kernel(size: int, std_cells: float, dtype: torch.dtype = torch.floa
     r = torch.arange(size, dtype=torch.float64) - size // 2
     weights = torch.exp(-(r**2) / (2.0 * std_cells**2))
     return (weights / weights.sum()).to(dtype)
+
+
+class GaussianDifference(NamedTuple):
+    """Separable difference of Gaussians: excitation minus inhibition.
+
+    Attributes:
+        excite: One odd 1-D kernel for each axis.
+        inhibit: The same of the inhibition.
+    """
+
+    excite: tuple[Tensor, ...]
+    inhibit: tuple[Tensor, ...]
+
+
+def gaussian_difference(
+    excite: Sequence[tuple[int, float]],
+    inhibit: Sequence[tuple[int, float]],
+    dtype: torch.dtype = torch.float64,
+) -> GaussianDifference:
+    r"""Make the kernels of a difference of Gaussians, each Gaussian with sum 1.
+
+    .. math:: w = \textstyle\prod_a G_{\sigma^E_a} - \prod_a G_{\sigma^I_a}
+
+    Args:
+        excite: Size in cells and standard deviation in cells for each axis.
+        inhibit: The same of the inhibition.
+        dtype: Of the kernels.
+
+    Example:
+        >>> kernels = gaussian_difference([(3, 1.0), (5, 1.0)], [(5, 2.0), (5, 2.0)])
+        >>> [len(k) for k in kernels.excite], [len(k) for k in kernels.inhibit]
+        ([3, 5], [5, 5])
+    """
+    return GaussianDifference(
+        tuple(gaussian_kernel(size, std, dtype) for size, std in excite),
+        tuple(gaussian_kernel(size, std, dtype) for size, std in inhibit),
+    )
+
+
+def convolve_axes(
+    activity: Tensor, kernels: Sequence[Tensor], circular: Sequence[bool] | bool = True
+) -> Tensor:
+    r"""Convolve the last axes with a separable kernel; an axis is a ring or has ends.
+
+    .. math:: h_{i_1 \dots i_k} = \sum_{r_1 \dots r_k} w^1_{r_1} \cdots w^k_{r_k}
+              \, a_{i_1 - r_1 \dots i_k - r_k}
+
+    Beyond the ends of an axis that is no ring there is no activity. Differentiable in both.
+
+    Args:
+        activity: ``(..., n_1, ..., n_k)``, with any batch dimensions.
+        kernels: Odd 1-D kernel for each of the last :math:`k` axes, no longer than a ring.
+        circular: Whether each of these axes is a ring; one value for all.
+
+    Returns:
+        Same shape.
+
+    Example:
+        >>> one = torch.zeros(4, 4, dtype=torch.float64); one[0, 0] = 1.0
+        >>> side = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+        >>> convolve_axes(one, (side, side), (True, False)).sum().item()  # lost at the end
+        0.0
+    """
+    rings = (circular,) * len(kernels) if isinstance(circular, bool) else tuple(circular)
+    out = activity
+    first = activity.dim() - len(kernels)
+    for axis, (kernel, ring) in enumerate(zip(kernels, rings, strict=True), start=first):
+        reach = kernel.shape[0] // 2
+        last = out.movedim(axis, -1)
+        lines = last.reshape(-1, 1, last.shape[-1])
+        pads = F.pad(lines, (reach, reach), mode="circular" if ring else "constant")
+        lines = F.conv1d(pads, kernel.flip(0)[None, None])  # conv1d correlates
+        out = lines.reshape(last.shape).movedim(-1, axis)
+    return out
+
+
+def excite_and_inhibit(
+    activity: Tensor,
+    kernels: GaussianDifference,
+    gains: tuple[float, float],
+    circular: Sequence[bool] | bool = True,
+) -> Tensor:
+    r"""Let neighbours excite each other and a surround inhibit, once, and rectify.
+
+    .. math:: r = [a + g_E \, G_E * a - g_I \, G_I * a]_+
+
+    Args:
+        activity: :math:`a`, ``(..., n_1, ..., n_k)``.
+        kernels: :math:`G_E, G_I`.
+        gains: :math:`g_E, g_I`; where one is 0 its convolution is left out.
+        circular: As in :func:`convolve_axes`.
+
+    Returns:
+        Same shape, non-negative.
+
+    Example:
+        >>> kernels = gaussian_difference([(3, 1.0)], [(5, 2.0)])
+        >>> excite_and_inhibit(torch.eye(6, dtype=torch.float64), kernels, (0.0, 0.0)).sum().item()
+        6.0
+    """
+    out = activity
+    for kernel, gain in zip(kernels, (gains[0], -gains[1]), strict=True):
+        if gain:
+            out = out + gain * convolve_axes(activity, kernel, circular)
+    return out.clamp_min(0.0)
 
 
 def circulant(kernel: Tensor, n_in: int, n: int, reach: int | None = None) -> Tensor:
@@ -149,13 +255,7 @@ def circular_convolve(
         pad = [kernel.shape[0] // 2 for kernel in reversed(kernels) for _ in range(2)]
         out = F.conv3d(F.pad(flat, pad, mode="circular"), weight[None, None])
         return out.reshape(activity.shape)
-    out = flat[:, 0]
-    for axis, kernel in zip((1, 2, 3), kernels, strict=True):
-        last = out.movedim(axis, -1)
-        lines = last.reshape(-1, 1, last.shape[-1])
-        reach = kernel.shape[0] // 2
-        lines = F.conv1d(F.pad(lines, (reach, reach), mode="circular"), kernel.flip(0)[None, None])
-        out = lines.reshape(last.shape).movedim(-1, axis)
+    out = convolve_axes(flat[:, 0], kernels)
     return out.reshape(*batch, *activity.shape[-3:])
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroslam.cells.boundary import BoundaryCells, check_motion, check_walls, checked_walls
+from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.cells.familiarity import SURE, Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.joining import join_navigation, navigation_faults, view_frames
@@ -93,6 +94,8 @@ class NavigationCells(Population):
         self._estimate: NavigationEstimate | None = None  # of the last frame
         self.batch = batch
         self.boundary = BoundaryCells(config.boundary_cells, batch)
+        cells_sense = config.wall_memory.senses == "boundary_cells"
+        self.sheet = BoundarySheet(config.boundary_cells) if cells_sense else None
         self.oscillators = VelocityOscillators(config.grid_cells, batch)
         self.grid = LAHNGridCells(config.grid_cells, batch)
         self.place = CompetitiveHebbianPlaceCells(
@@ -118,6 +121,7 @@ class NavigationCells(Population):
         wall_bearing_rad: Tensor,
         *,
         compass: bool = True,
+        read: bool = False,
     ) -> NavigationEstimate:
         """Advance by one step of motion, and correct by the walls at its end.
 
@@ -129,6 +133,7 @@ class NavigationCells(Population):
                 ``([batch,] n_walls)``, nearest first; ``inf`` where there is none.
             wall_bearing_rad: Its bearing relative to the heading, the same shape.
             compass: Whether the heading is measured; else it is integrated from turn rates.
+            read: Whether the walls were read from the sheet of boundary cells already.
 
         Raises:
             BadFrame: If a number is not finite or a distance negative; nothing has changed then.
@@ -152,6 +157,9 @@ class NavigationCells(Population):
             self.boundary.rest()
         step = memory.move(speed_m_s, heading_rad, dt_s)
         correction = torch.zeros_like(step)
+        if self.sheet is not None and not read and nearest < math.inf and self._uses_walls(dt_s):
+            wall_m, bearing, _ = self.sheet.read(self.sheet(wall_m, bearing))
+            nearest = float(wall_m.min()) if wall_m.numel() else math.inf
         if nearest < math.inf and memory.is_due and self.config.wall_memory.corrects:
             believed = oscillators.decode() + step
             correction = memory.update_from_walls(
@@ -181,6 +189,11 @@ class NavigationCells(Population):
             lost if self.batch is not None else lost[0],
         )
 
+    def _uses_walls(self, dt_s: float) -> bool:
+        """Return whether walls are used in this step: to correct, or to compare."""
+        corrects = self.walls.is_due and self.config.wall_memory.corrects
+        return corrects or self.now.since_s + dt_s >= FAMILIARITY_PERIOD_S
+
     def observe(self, frame: Frame) -> np.ndarray | None:
         """Return the walls of a frame, ``(n, 2)``: as measured, or found in its ranges.
 
@@ -190,6 +203,8 @@ class NavigationCells(Population):
         if frame.walls is not None:
             return checked_walls(frame.walls)
         if frame.ranges is not None:
+            if self.sheet is not None:
+                return self.sheet.walls_in_scan(frame.ranges)
             return walls_in_scan(frame.ranges, self.config.boundary_cells.reach_m)
         return None
 

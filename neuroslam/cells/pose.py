@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.cells.attractor import Couplings, couplings, decode, inject, path_integrate, settle
-from neuroslam.cells.convolve import Kernels, Packet, gaussian_kernel, to_dense, to_packet
+from neuroslam.cells.convolve import Kernels, Packet, gaussian_difference, to_dense, to_packet
 from neuroslam.cells.pose_joining import move_session
 from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all
 from neuroslam.config import BrainConfig, PoseCellConfig
@@ -120,11 +120,11 @@ class PoseCellNetwork(Population):
     def kernels(self) -> tuple[Kernels, Kernels]:
         """Excitation and inhibition kernels: the 1-D factors for theta, y and x."""
         c = self.config
-        place = gaussian_kernel(c.excite_size, c.excite_std_xy)
-        excite = (gaussian_kernel(c.excite_size, c.excite_std_theta), place, place)
-        place = gaussian_kernel(c.inhibit_size, c.inhibit_std_xy)
-        inhibit = (gaussian_kernel(c.inhibit_size, c.inhibit_std_theta), place, place)
-        return excite, inhibit
+        made = gaussian_difference(
+            [(c.excite_size, c.excite_std_theta)] + 2 * [(c.excite_size, c.excite_std_xy)],
+            [(c.inhibit_size, c.inhibit_std_theta)] + 2 * [(c.inhibit_size, c.inhibit_std_xy)],
+        )
+        return cast(Kernels, made.excite), cast(Kernels, made.inhibit)
 
     @property
     def packet(self) -> Packet:

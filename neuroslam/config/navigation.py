@@ -1,7 +1,7 @@
 """Sections of a brain's config: boundary, grid and place cells, and the memory of walls."""
 
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -50,6 +50,37 @@ class BoundaryCellConfig(Section):
     )
     sigma_bearing_rad: float = Field(
         default=0.5, gt=0, description="width of the bearing tuning; larger: broader fields"
+    )
+    sheet_bearings: int = Field(
+        default=72,
+        ge=16,
+        description="cells of the sheet around the full turn, if wall_memory.senses is "
+        "boundary_cells; larger: finer bearing, slower",
+    )
+    sheet_sigma_bearing_rad: float = Field(
+        default=0.15,
+        ge=0.08,
+        le=1.0,
+        description="width of the sheet's tuning to bearing; larger: walls farther apart merge",
+    )
+    sheet_excitation: float = Field(
+        default=0.5,
+        ge=0,
+        description="gain of the excitation between neighbours on the sheet; larger: noise is "
+        "averaged over more cells",
+    )
+    sheet_inhibition: float = Field(
+        default=0.8,
+        ge=0,
+        description="gain of the inhibition by the surround on the sheet; larger: weak responses "
+        "beside strong ones are suppressed",
+    )
+    sheet_share: float = Field(
+        default=0.3,
+        gt=0,
+        lt=1,
+        description="response of a local maximum that is read as a wall, as a share of that to one "
+        "clear wall; larger: fewer false walls, more missed ones",
     )
 
 
@@ -205,6 +236,12 @@ class PlaceCellConfig(Section):
 
 class WallMemoryConfig(Section):
     """Memory of walls, and the noise of motion and senses that it assumes."""
+
+    senses: Literal["walls", "boundary_cells"] = Field(
+        default="walls",
+        description="what the memory and the familiarity of walls take: the walls as measured, or "
+        "what is read from the sheet of boundary cells",
+    )
 
     corrects: bool = Field(
         default=True,

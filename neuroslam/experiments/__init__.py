@@ -27,6 +27,11 @@ EXPERIMENTS = {
         "boundary_scenarios",
         None,
     ),
+    "boundary-cells": (
+        "neuroslam.experiments.boundary_sheet",
+        "boundary_cells_in_loop",
+        "rodent",
+    ),
     "head-direction": ("neuroslam.experiments.head_direction", "head_direction", None),
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),

@@ -90,6 +90,7 @@ def plot_errors(
     errors_m: Mapping[str, Mapping[str, np.ndarray]],
     marks_m: Mapping[str, float] | None = None,
     title: str | None = None,
+    colours: Mapping[str, str] | None = None,
 ) -> Figure:
     """Draw the errors of several methods on several tracks as bars.
 
@@ -97,6 +98,7 @@ def plot_errors(
         errors_m: Method -> track -> errors in metres, one for each seed; bars have mean and sd.
         marks_m: Name -> error of a reference: a dotted line.
         title: Title of the whole figure.
+        colours: Method -> colour; :func:`colour_of` if not given.
 
     Raises:
         ValueError: If there are no errors.
@@ -105,6 +107,7 @@ def plot_errors(
         raise ValueError("plot_errors: expected at least one method")
     tracks = list(dict.fromkeys(track for values in errors_m.values() for track in values))
     wide = 0.8 / len(errors_m)
+    chosen = colours or {method: colour_of(method) for method in errors_m}
     with mpl.rc_context(STYLE):
         figure = new_figure(max(7.0, 1.8 * len(tracks) + 1.5), 4.2, title)
         axes = figure.subplots()
@@ -114,14 +117,14 @@ def plot_errors(
             sd = [100.0 * np.std(seeds) for seeds in values.values()]
             look: dict[str, Any] = {"ecolor": INK, "error_kw": {"lw": 1.0}, "capsize": 2}
             look["zorder"] = 3
-            axes.bar(at, mean, 0.92 * wide, yerr=sd, color=colour_of(method), label=method, **look)
+            axes.bar(at, mean, 0.92 * wide, yerr=sd, color=chosen[method], label=method, **look)
         for mark in (marks_m or {}).values():
             axes.axhline(100.0 * mark, **_MARK)
         axes.set_xticks(range(len(tracks)), tracks)
         axes.grid(visible=False, axis="x")
         axes.set(ylabel="mean position error (cm)")
         write_title(axes, "Position error, not aligned", "bars: mean over seeds; whiskers: sd")
-        key: list[Artist] = [Patch(color=colour_of(method), label=method) for method in errors_m]
+        key: list[Artist] = [Patch(color=chosen[method], label=method) for method in errors_m]
         key += _marks(marks_m)
         figure.legend(handles=key, loc="outside lower center", ncols=len(key))
     return figure

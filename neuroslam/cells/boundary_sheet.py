@@ -1,0 +1,317 @@
+"""Boundary cells as a sheet of bearing by warped distance, whose responses are read as walls."""
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from neuroslam.cells.convolve import (
+    GaussianDifference,
+    circulant,
+    convolve_axes,
+    excite_and_inhibit,
+    gaussian_difference,
+)
+from neuroslam.config import BoundaryCellConfig
+from neuroslam.geometry import TWO_PI
+from neuroslam.sensors.scan import checked_ranges
+
+_CELLS_PER_SIGMA = 3.0  # on the axis of distance
+_MARGIN = 3.0  # of the axis of distance beyond 0 and reach_m, in widths
+_SURROUND = 2.0  # width of the inhibition over that of the tuning
+_CUT = 6.0  # half the size of a tuning kernel, in widths
+_ROUNDS = 4  # of the population vector
+_WINDOW = 5  # cells on either side that the population vector takes
+_SIDE_RAD = math.radians(40.0)  # beams on either side of a bearing that its cells take
+_RINGS = (True, False)  # bearing, distance
+
+
+def warp(distance_m: Tensor, beta_m: float) -> Tensor:
+    r"""Return the warped distance, on which the distance tuning has one width.
+
+    .. math:: \xi = \beta \ln(d / \beta + 1), \qquad
+              \frac{d\xi}{dd}\,\sigma_0 (d / \beta + 1) = \sigma_0
+
+    Example:
+        >>> round(warp(torch.tensor(0.3), 0.15).item(), 4)
+        0.1648
+    """
+    return beta_m * torch.log1p(distance_m / beta_m)
+
+
+def unwarp(xi_m: Tensor, beta_m: float) -> Tensor:
+    """Return the distance of a warped one; the inverse of :func:`warp`."""
+    return beta_m * torch.expm1(xi_m / beta_m)
+
+
+def warped_tuning(
+    distance_m: Tensor, bearing_rad: Tensor, axes: tuple[Tensor, Tensor], config: BoundaryCellConfig
+) -> Tensor:
+    r"""Return the responses of the sheet's cells to walls by their tuning curves, cell by cell.
+
+    .. math:: f_{kl} = \sum_\text{walls} e^{-(\alpha - \varphi_k)^2 / 2 \sigma_a^2}
+              e^{-(\xi(R) - \xi_l)^2 / 2 \sigma_0^2}
+
+    (SLRB, Eqs. 6 to 9, on the warped axis.) The definition: the sheet convolves instead.
+
+    Args:
+        distance_m: :math:`R`, ``(..., n_walls)``; ``inf`` for none.
+        bearing_rad: :math:`\alpha`, the same shape.
+        axes: :math:`\varphi_k` in radians, :math:`\xi_l` in metres.
+        config: Widths.
+
+    Returns:
+        ``(..., n_bearings, n_distances)``.
+    """
+    widths = config.sheet_sigma_bearing_rad, config.sigma_m
+    return _bumps(distance_m, bearing_rad, axes, widths, config.beta_m)
+
+
+def _bumps(
+    distance_m: Tensor,
+    bearing_rad: Tensor,
+    axes: tuple[Tensor, Tensor],
+    widths: tuple[float, float],
+    beta_m: float,
+) -> Tensor:
+    there = distance_m.isfinite()
+    far = warp(distance_m.where(there, 0.0), beta_m).unsqueeze(-1) - axes[1]
+    apart = (bearing_rad.unsqueeze(-1) - axes[0] + math.pi).remainder(TWO_PI) - math.pi
+    by_bearing = (apart / widths[0]).square().mul(-0.5).exp() * there.unsqueeze(-1)
+    return by_bearing.mT @ (far / widths[1]).square().mul(-0.5).exp()
+
+
+class BoundarySheet(nn.Module):
+    r"""Boundary cells on a ring of bearings and an axis of warped distances.
+
+    What is felt is rasterised on the sheet, convolved with the tuning kernel, and shaped by mutual
+    excitation and by inhibition of the surround, which are convolutions as well (SLRB, Section 2:
+    mutual excitation and inhibition):
+
+    .. math:: u = G * s, \qquad r = [u + g_E\, G_E * u - g_I\, G_I * u]_+
+
+    Its local maxima are read as walls. The sheet has no state.
+
+    Args:
+        config: Sizes, widths and gains.
+
+    Example:
+        >>> sheet = BoundarySheet(BoundaryCellConfig())
+        >>> felt = torch.tensor([0.1, 0.25]), torch.tensor([0.3, 2.0])
+        >>> distance, bearing, _ = sheet.read(sheet(*felt))
+        >>> distance.round(decimals=2).tolist(), bearing.round(decimals=2).tolist()
+        ([0.1, 0.25], [0.3, 2.0])
+    """
+
+    bearings_rad: Tensor
+    warped_m: Tensor
+
+    def __init__(self, config: BoundaryCellConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        kind = torch.float64
+        self.step_m = c.sigma_m / _CELLS_PER_SIGMA
+        low = _MARGIN * min(c.sigma_m, c.beta_m / (_MARGIN + 1.0))
+        top = c.beta_m * math.log1p(c.reach_m / c.beta_m) + _MARGIN * c.sigma_m
+        cells = math.ceil((top + low) / self.step_m) + 1
+        xi = self.step_m * torch.arange(cells, dtype=kind) - low
+        phi = torch.arange(c.sheet_bearings, dtype=kind) * (TWO_PI / c.sheet_bearings)
+        self.register_buffer("warped_m", xi, persistent=False)
+        self.register_buffer("bearings_rad", phi, persistent=False)
+        # Half of the variance of the tuning is in the raster, so that no wall falls between cells.
+        self.sigmas = (c.sheet_sigma_bearing_rad * c.sheet_bearings / TWO_PI, _CELLS_PER_SIGMA)
+        tuned = [(self._size(s, i), s) for i, s in enumerate(self.sigmas)]
+        half = [(size, s * math.sqrt(0.5)) for size, s in tuned]
+        wide = [
+            (self._size(_SURROUND * s, i, 3.0), _SURROUND * s) for i, s in enumerate(self.sigmas)
+        ]
+        made = gaussian_difference(tuned, wide)
+        halves = gaussian_difference(half, half).excite
+        for i in range(2):
+            self.register_buffer(f"_excite_{i}", made.excite[i], persistent=False)
+            self.register_buffer(f"_inhibit_{i}", made.inhibit[i], persistent=False)
+            self.register_buffer(f"_half_{i}", halves[i], persistent=False)
+            for name, sigma_kernel in (
+                ("excite", made.excite[i]), ("inhibit", made.inhibit[i]), ("half", halves[i]),
+            ):  # fmt: skip
+                n = (c.sheet_bearings, cells)[i]
+                ring = n if _RINGS[i] else n + len(sigma_kernel)
+                by = circulant(sigma_kernel, n, ring, reach=0)
+                self.register_buffer(f"_{name}_matrix_{i}", by, persistent=False)
+        middle = torch.tensor([c.reach_m / 2.0], dtype=kind)
+        self.clear = float(self(middle, torch.zeros(1, dtype=kind)).max())
+        beams = TWO_PI * np.arange(360) / 360
+        ahead = np.full(360, np.inf)
+        ahead[np.cos(beams) > 0.2] = c.reach_m / 2.0 / np.cos(beams)[np.cos(beams) > 0.2]
+        self.clear_scan = float(self.respond_to_scan(ahead).max())
+
+    def _size(self, sigma: float, axis: int, cut: float = _CUT) -> int:
+        n = (self.config.sheet_bearings, len(self.warped_m))[axis]
+        return min(2 * math.ceil(cut * sigma) + 1, n - 1 + n % 2)
+
+    def _kernels(self, name: str) -> tuple[Tensor, Tensor]:
+        return self.get_buffer(f"_{name}_0"), self.get_buffer(f"_{name}_1")
+
+    def forward(self, distance_m: Tensor, bearing_rad: Tensor) -> Tensor:
+        """Return the responses to walls, ``(..., n_bearings, n_distances)``, non-negative.
+
+        Args:
+            distance_m: Distance to the foot of the perpendicular, ``(..., n_walls)``; ``inf`` for
+                none.
+            bearing_rad: Its bearing, the same shape.
+        """
+        axes = self.bearings_rad, self.warped_m
+        walls = distance_m.to(self.warped_m), bearing_rad.to(self.warped_m)
+        return self.interact(warped_tuning(*walls, axes, self.config))
+
+    def tuned(self, distance_m: Tensor, bearing_rad: Tensor) -> Tensor:
+        """Return the raster convolved with the tuning kernel; equal to :func:`warped_tuning`.
+
+        A step evaluates the latter, which is faster for a few walls.
+        """
+        c = self.config
+        root = math.sqrt(0.5)
+        reach = len(self._kernels("half")[1]) // 2  # walls beyond the ends drive cells within
+        beyond = self.step_m * torch.arange(1, reach + 1).to(self.warped_m)
+        axis = [self.warped_m[0] - beyond.flip(0), self.warped_m, self.warped_m[-1] + beyond]
+        raster = _bumps(
+            distance_m.to(self.warped_m),
+            bearing_rad.to(self.warped_m),
+            (self.bearings_rad, torch.cat(axis)),
+            (root * c.sheet_sigma_bearing_rad, root * c.sigma_m),
+            c.beta_m,
+        )
+        # Two factors of sqrt 2 keep the peak of one wall at 1.
+        spread = convolve_axes(raster, self._kernels("half"), _RINGS)
+        return 2.0 * spread[..., reach:-reach]
+
+    def interact(self, tuned: Tensor) -> Tensor:
+        """Do as :meth:`interact_by_convolution`, by matrices: faster on a small sheet."""
+        c, out = self.config, tuned
+        for name, gain in (("excite", c.sheet_excitation), ("inhibit", -c.sheet_inhibition)):
+            if gain:
+                out = out + gain * self._multiply(tuned, name, name)
+        return out.clamp_min(0.0)
+
+    def _multiply(self, values: Tensor, bearing: str, distance: str) -> Tensor:
+        ring = self.get_buffer(f"_{bearing}_matrix_0")
+        return ring @ (values @ self.get_buffer(f"_{distance}_matrix_1").mT)
+
+    def interact_by_convolution(self, tuned: Tensor) -> Tensor:
+        """Let neighbours excite each other, the surround inhibit, and rectify: the definition."""
+        c = self.config
+        pair = GaussianDifference(self._kernels("excite"), self._kernels("inhibit"))
+        return excite_and_inhibit(tuned, pair, (c.sheet_excitation, c.sheet_inhibition), _RINGS)
+
+    def respond_to_scan(self, ranges: np.ndarray) -> Tensor:
+        r"""Return the responses to the beams of a scan, at bearings relative to the heading.
+
+        A cell sums all beams within 40 degrees of its bearing, each by the distance of its point
+        along that bearing, :math:`r \cos(\theta - \varphi_k)`, the integral of Hartley et al.
+        2000. A wall is felt on both sides of its foot, so that corners are none: the response is
+        the geometric mean of the two sides.
+
+        Args:
+            ranges: As for :func:`~neuroslam.sensors.scan.walls_in_scan`, ``(n,)``.
+        """
+        sides = torch.from_numpy(self._rasterise(checked_ranges(ranges)))
+        scale = math.sqrt(TWO_PI) * self.sigmas[1]
+        left, right = self._multiply(sides.to(self.warped_m), "half", "excite").unbind(0)
+        return self.interact(scale * (left * right).clamp_min(0.0).sqrt())
+
+    def _rasterise(self, ranges: np.ndarray) -> np.ndarray:
+        n, c = len(ranges), self.config
+        bins, cells = c.sheet_bearings, len(self.warped_m)
+        top = float(self.warped_m[-1])
+        farthest = c.beta_m * math.expm1(top / c.beta_m) / math.cos(_SIDE_RAD)
+        used = np.flatnonzero(ranges < farthest)
+        theta = used * (TWO_PI / n)
+        reach = int(_SIDE_RAD * bins / TWO_PI)
+        nearest = np.rint(theta * (bins / TWO_PI)).astype(np.int64)
+        k = nearest[:, None] + np.arange(-reach, reach + 1)
+        apart = theta[:, None] - k * (TWO_PI / bins)
+        at = c.beta_m * np.log1p(ranges[used, None] * np.cos(apart) / c.beta_m)
+        at = (at - float(self.warped_m[0])) / self.step_m
+        low = np.floor(at).astype(np.int64)
+        share = at - low
+        flat = (k % bins) * cells + low
+        sides = np.zeros((2, bins * cells))
+        each = (TWO_PI / n) / (reach * TWO_PI / bins)
+        for side, sign in enumerate((1.0, -1.0)):
+            weight = each * (0.5 + 0.5 * np.sign(np.where(np.abs(apart) < 1e-9, 0, sign * apart)))
+            for cell, part in ((0, 1.0 - share), (1, share)):
+                good = low + cell < cells
+                sides[side] += np.bincount((flat + cell)[good], (weight * part)[good], bins * cells)
+        return sides.reshape(2, bins, cells)
+
+    def read(self, rates: Tensor, clear: float | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Read walls from the responses: each local maximum is one, by its population vector.
+
+        .. math:: m \leftarrow m + 2 \Big(\frac{\sum_i w_i q_i}{\sum_i w_i} - m\Big), \qquad
+                  w_i = r_i \, e^{-|q_i - m|^2 / 2 \sigma^2}
+
+        with :math:`q_i` the places of the cells around the maximum, in widths :math:`\sigma` of
+        the tuning.
+
+        Args:
+            rates: Responses, ``([batch,] n_bearings, n_distances)``.
+            clear: Response to one clear wall; of walls if not given.
+
+        Returns:
+            Distance in metres (``inf`` for none), bearing in radians in [0, 2 pi), and standard
+            deviation of distance in metres, ``([batch,] n)`` each, nearest first.
+        """
+        batch = rates if rates.dim() == 3 else rates[None]
+        lowest = self.config.sheet_share * (self.clear if clear is None else clear)
+        w = _WINDOW
+        padded = F.pad(F.pad(batch, (0, 0, w, w), mode="circular"), (w, w))
+        inner = padded[:, w - 1 : 1 - w, w - 1 : 1 - w].unsqueeze(1)
+        peaks = (batch >= F.max_pool2d(inner, 3, 1)[:, 0]) & (batch > lowest)
+        row, k, d = peaks.nonzero(as_tuple=True)
+        count = torch.bincount(row, minlength=len(batch))
+        shape = len(batch), int(count.max()) if len(row) else 0
+        distance = batch.new_full(shape, math.inf)
+        bearing, width = batch.new_zeros(shape), batch.new_zeros(shape)
+        if len(row):
+            offset = torch.arange(-w, w + 1, device=batch.device)
+            patch = padded[
+                row[:, None, None], (k[:, None] + w + offset)[:, :, None],
+                (d[:, None] + w + offset)[:, None, :],
+            ]  # fmt: skip
+            off = offset.to(batch)
+            by, bd = batch.new_zeros(len(row)), batch.new_zeros(len(row))
+            s_a, s_d = self.sigmas
+            for _ in range(_ROUNDS):
+                wa = ((off - by[:, None]) / s_a).square().mul(-0.5).exp()
+                wd = ((off - bd[:, None]) / s_d).square().mul(-0.5).exp()
+                weights = patch * wa[:, :, None] * wd[:, None, :]
+                total = weights.sum((1, 2))
+                ma = (weights.sum(2) @ off) / total
+                md = (weights.sum(1) @ off) / total
+                spread = (weights.sum(1) * (off - md[:, None]).square()).sum(1) / total
+                by = (by + 2.0 * (ma - by)).clamp(-1.0, 1.0)
+                bd = (bd + 2.0 * (md - bd)).clamp(-1.0, 1.0)
+            xi = self.warped_m[d] + bd * self.step_m
+            found = unwarp(xi, self.config.beta_m).clamp_min(0.0)
+            angle = (self.bearings_rad[k] + by * (TWO_PI / self.config.sheet_bearings)) % TWO_PI
+            narrow = 1.0 / (1.0 / spread.clamp_max(0.99 * s_d**2) - 1.0 / s_d**2)
+            sd = narrow.sqrt() * self.step_m * (found / self.config.beta_m + 1.0)
+            slot = torch.arange(len(row), device=batch.device) - (count.cumsum(0) - count)[row]
+            distance[row, slot], bearing[row, slot], width[row, slot] = found, angle, sd
+            distance, order = distance.sort(1)
+            bearing, width = bearing.gather(1, order), width.gather(1, order)
+        if rates.dim() == 3:
+            return distance, bearing, width
+        return distance[0], bearing[0], width[0]
+
+    def walls_in_scan(self, ranges: np.ndarray) -> np.ndarray:
+        """Read the walls of a scan: distance (m) and bearing relative to the heading, ``(n, 2)``.
+
+        Raises:
+            BadFrame: If the ranges are invalid.
+        """
+        with torch.inference_mode():
+            distance, bearing, _ = self.read(self.respond_to_scan(ranges), self.clear_scan)
+        return torch.stack([distance, bearing], dim=1).numpy()

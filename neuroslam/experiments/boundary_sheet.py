@@ -1,0 +1,157 @@
+"""Boundary cells in the loop against raw walls: errors with and without noisy beams, lesions."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuroslam.cells.boundary_sheet import BoundarySheet
+from neuroslam.config import BoundaryCellConfig, BrainConfig
+from neuroslam.experiments.animals import (
+    RATE_HZ,
+    TRACKS,
+    WALLS,
+    arena_of,
+    position_errors,
+    read_track,
+    run_cells,
+)
+from neuroslam.experiments.boundary_cells import write_results
+from neuroslam.figures.place_errors import plot_errors
+from neuroslam.figures.style import CURVES, save
+from neuroslam.sensors.scan import walls_in_scan
+from neuroslam.worlds.rodent import Walk
+from neuroslam.worlds.senses import REACH_M, SenseNoise, Senses, sense
+
+BEAMS = 180
+BEAM_REACH_M = 5.0
+BEAM_SIGMA_M = 0.03
+OUTLIERS = 0.1
+SCAN_EVERY = round(0.25 * RATE_HZ)
+"""Steps between two scans: the period of the corrections by walls."""
+
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "raw walls": {},
+    "boundary cells": {"wall_memory": {"senses": "boundary_cells"}},
+    "tuning 3 x wider": {
+        "wall_memory": {"senses": "boundary_cells"},
+        "boundary_cells": {"sheet_sigma_bearing_rad": 0.45, "sigma_m": 0.072},
+    },
+    "no inhibition": {
+        "wall_memory": {"senses": "boundary_cells"},
+        "boundary_cells": {"sheet_inhibition": 0.0},
+    },
+    "cells silent": {"wall_memory": {"corrects": False}},
+}
+"""Condition -> sections of the config. Without responses no wall reaches memory: no correction."""
+
+
+def boundary_cells_in_loop(
+    data_folder: Path,
+    out_folder: Path,
+    minutes: float = 30.0,
+    seeds: Sequence[int] = range(10),
+    beam_seeds: Sequence[int] = range(3),
+    tracks: Sequence[str] = tuple(TRACKS),
+) -> dict[str, Any]:
+    """Compare positions with raw walls, with boundary cells, and with the cells impaired.
+
+    Args:
+        data_folder: Folder of the recordings.
+        out_folder: ``results.json``, ``feet.png`` and ``noisy_beams.png`` are written there.
+        minutes: Length of a walk.
+        seeds: Seed of the noise of each animal.
+        beam_seeds: The same for walks with noisy beams, which take longer.
+        tracks: Names of tracks.
+
+    Returns:
+        The content of ``results.json``: ``rows``, one for each track, input and condition.
+    """
+    out, rows = Path(out_folder), []
+    for name in tracks:
+        walk = read_track(Path(data_folder), name, minutes)
+        feet = sense(walk, SenseNoise(), seeds, k=WALLS)
+        for condition in CONDITIONS:
+            rows.append({"track": name, "input": "feet", **run(feet, walk, condition)})
+        motion = sense(walk, SenseNoise(), beam_seeds, k=WALLS)
+        scans = noisy_scans(walk, beam_seeds)
+        for condition in ("raw walls", "boundary cells"):
+            felt = with_scans(motion, scans, condition)
+            rows.append({"track": name, "input": "noisy beams", **run(felt, walk, condition)})
+    for kind in ("feet", "noisy beams"):
+        errors = {
+            condition: {
+                row["track"]: np.array(row["errors_m"])
+                for row in rows
+                if row["input"] == kind and row["condition"] == condition
+            }
+            for condition in CONDITIONS
+        }
+        errors = {condition: values for condition, values in errors.items() if values}
+        title = f"Boundary cells in the loop: walls as {kind}, {minutes:g} minutes"
+        colours = dict(zip(CONDITIONS, CURVES, strict=False))
+        figure = plot_errors(errors, title=title, colours=colours)
+        save(figure, out / f"{kind.replace(' ', '_')}.png")
+    return write_results(out, {"experiment": "boundary-cells", "minutes": minutes, "rows": rows})
+
+
+def run(senses: Senses, walk: Walk, condition: str) -> dict[str, Any]:
+    """Run animals under a condition and return their errors in metres."""
+    estimate = np.empty((len(senses.time_s), len(senses.speed_m_s), 2))
+
+    def note(i: int, here: Any, cells: Any) -> None:  # noqa: ANN401 - a hook
+        estimate[i] = here.position_m.numpy()
+
+    began = time.perf_counter()
+    config = BrainConfig.model_validate(CONDITIONS[condition])
+    cells = run_cells(senses, config, note)
+    each_ms = 1e3 * (time.perf_counter() - began) / len(senses.time_s)
+    errors = position_errors(np.moveaxis(estimate, 1, 0) + walk.positions[0], walk.positions)
+    return {
+        "condition": condition,
+        "error_m": float(errors.mean_m.mean()),
+        "errors_m": errors.mean_m.tolist(),
+        "error_sd_m": float(errors.mean_m.std()),
+        "ate_m": float(errors.aligned_m.mean()),
+        "place_cells": float(cells.place.n_cells.double().mean()),
+        "batch_step_ms": each_ms,
+    }
+
+
+def noisy_scans(walk: Walk, seeds: Sequence[int]) -> np.ndarray:
+    """Scan at every correction: ranges with noise and outliers, ``(seeds, scans, BEAMS)``.
+
+    A beam that is an outlier has a range evenly distributed up to its reach.
+    """
+    at = slice(SCAN_EVERY - 1, None, SCAN_EVERY)
+    true = arena_of(walk).ranges(walk.positions[at], walk.headings_rad[at], BEAMS, BEAM_REACH_M)
+    scans = np.empty((len(seeds), *true.shape))
+    for scan, seed in zip(scans, seeds, strict=True):
+        rng = np.random.default_rng([seed, 1])
+        scan[:] = np.maximum(true + BEAM_SIGMA_M * rng.standard_normal(true.shape), 0.0)
+        wrong = rng.random(true.shape) < OUTLIERS
+        scan[wrong] = rng.uniform(0.0, BEAM_REACH_M, int(wrong.sum()))
+    return scans
+
+
+def with_scans(motion: Senses, scans: np.ndarray, condition: str) -> Senses:
+    """Return the senses with the walls that are found in the scans, the nearest ``WALLS``.
+
+    The detector of lines is told the noise of the beams; its default finds hardly any wall.
+    """
+    sheet = BoundarySheet(BoundaryCellConfig())
+    raw = partial(walls_in_scan, reach_m=REACH_M, tolerance_m=BEAM_SIGMA_M)
+    find = raw if condition == "raw walls" else sheet.walls_in_scan
+    distance = np.full_like(motion.wall_m, np.inf)
+    bearing = np.zeros_like(motion.wall_bearing_rad)
+    for animal, own in enumerate(scans):
+        for k, scan in enumerate(own):
+            i = SCAN_EVERY * (k + 1) - 1
+            walls = find(scan)
+            walls = walls[walls[:, 0] <= REACH_M][:WALLS]
+            distance[animal, i, : len(walls)] = walls[:, 0]
+            bearing[animal, i, : len(walls)] = walls[:, 1]
+    return motion._replace(wall_m=distance, wall_bearing_rad=bearing)
