@@ -91,7 +91,7 @@ def boundary_cells_in_loop(
             for condition in CONDITIONS
         }
         errors = {condition: values for condition, values in errors.items() if values}
-        title = f"Boundary cells in the loop: walls as {kind}, {minutes:g} minutes"
+        title = f"Boundary cells in the loop: walls as {kind}, {minutes:g} min"
         colours = dict(zip(CONDITIONS, CURVES, strict=False))
         figure = plot_errors(errors, title=title, colours=colours)
         save(figure, out / f"{kind.replace(' ', '_')}.png")
