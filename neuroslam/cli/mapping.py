@@ -23,6 +23,7 @@ from neuroslam.cli.options import (
     Source,
     Start,
     Stop,
+    Truth,
 )
 from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
 from neuroslam.cli.progress import show_frames
@@ -49,6 +50,7 @@ def run_command(
     ] = None,
     confirm: Confirm = None,
     landmarks: Landmarks = None,
+    truth: Truth = None,
     start: Start = 0,
     stop: Stop = None,
     on_bad_frame: BadFrame = OnBadFrame.stop,
@@ -72,6 +74,7 @@ def run_command(
             settings,
             maps=maps or (),
             landmarks=landmarks,
+            truth=truth,
             preset=preset or "",
             start=start,
             stop=stop,
@@ -189,6 +192,11 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         say(
             f"ATE (rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
             f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
+        )
+    if "ate_similarity_rmse_m" in summary.accuracy:
+        say(
+            f"ATE (similarity): map {summary.accuracy['ate_similarity_rmse_m']:.3f} m, over "
+            f"{counted(int(summary.accuracy['frames_with_truth']), 'frame')} with truth"
         )
     say(f"Written: {out}")
     if summary.failure:

@@ -48,6 +48,12 @@ Landmarks = Annotated[
         metavar="FILE", help="Names and attributes of landmarks, walls, regions: CSV or TOML."
     ),
 ]
+Truth = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Ground truth: a TUM file, or a CSV of time_s,x_m,y_m[,theta_rad]."
+    ),
+]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
 ConfigFile = Annotated[

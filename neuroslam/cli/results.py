@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.table import Table
 
-from neuroslam.cli.options import Landmarks, MapFile, RunFolder
+from neuroslam.cli.options import Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
 from neuroslam.errors import counted
@@ -145,9 +145,7 @@ def plan_command(
 
 def evaluate_command(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth as a TUM file; a run of a world has its own.")
-    ] = None,
+    truth: Truth = None,
     align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
     against: Annotated[
         Path | None,

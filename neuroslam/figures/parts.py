@@ -58,13 +58,17 @@ def _align_truth(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray 
             f"plot_map: truth_xy has {len(truth)} points and the track {len(track)}; "
             "give track_xy with a point for each of the truth"
         )
+    known = np.isfinite(truth).all(axis=1)  # rows without a true position leave gaps
+    if not known.any():
+        return _Truth(None, segments, "")
+    seen, true = track[known], truth[known]
     mode: AlignmentMode = "similarity"
     try:
-        alignment = align(track, truth, mode)
+        alignment = align(seen, true, mode)
     except MapError:  # a robot that stood still fixes no rotation, but there is still an error
         mode = "none"
-        alignment = align(track, truth, mode)
-    ate = absolute_trajectory_error(track, truth, mode).rmse
+        alignment = align(seen, true, mode)
+    ate = absolute_trajectory_error(seen, true, mode).rmse
     how = f"scaled by {1.0 / alignment.scale:.3g}" if mode == "similarity" else "not aligned"
     walls_on_map = alignment.undo(segments.reshape(-1, 2)).reshape(-1, 2, 2)
     return _Truth(alignment.undo(truth), walls_on_map, f"truth: ATE {_metres(ate)}, {how}")

@@ -161,8 +161,10 @@ def truth_on_map(
         Positions ``(frames, 2)`` in the coordinates of the map, and metres of the truth per metre
         of the map; ``None`` without truth, or if the track fixes no alignment.
     """
-    on_map = np.isfinite(track[:, 0])
-    if truth is None or not on_map.any():
+    if truth is None:
+        return None, None
+    on_map = np.isfinite(track[:, 0]) & np.isfinite(truth[:, 0])
+    if not on_map.any():
         return None, None
     try:
         alignment = align(track[on_map, :2], truth[on_map, :2], "similarity")

@@ -22,6 +22,7 @@ from neuroslam.figures.sessions import plot_overlay
 from neuroslam.figures.style import save
 from neuroslam.runs.files import brain_file
 from neuroslam.runs.reading import read_trace, track_file, true_poses
+from neuroslam.runs.truth import read_truth
 
 
 def evaluate(
@@ -34,9 +35,11 @@ def evaluate(
 
     Args:
         track: Folder of a run, or a TUM file.
-        truth: TUM file; not needed for a run whose source knows the truth.
+        truth: TUM file, or CSV (:func:`~neuroslam.runs.truth.read_truth`); not needed for a run
+            whose source knows the truth, or that was made with a truth file.
         align: How the track is aligned with the truth before the comparison.
-        on_note: Called with a note if frames without a true pose are left out.
+        on_note: Called with a note if frames without a true pose are left out, or headings are
+            unknown: there is no relative error then.
 
     Returns:
         Name of the error, its statistics, its unit.
@@ -50,7 +53,7 @@ def evaluate(
     out = track if track.is_dir() else None
     found = read_tum(track if out is None else track_file(out))
     if truth is not None:
-        true = read_tum(Path(truth))
+        true = read_truth(truth)
         i, j = associate(found.times_s, true.times_s)
         estimate, reference = found.poses[i], true.poses[j]
     else:
@@ -58,10 +61,11 @@ def evaluate(
         true_track = None if trace is None else true_poses(trace)
         if trace is None or true_track is None:
             raise RunError(
-                f"{track}: its source has no ground truth; give a TUM file with --truth FILE"
+                f"{track}: its source has no ground truth; give a TUM file or CSV with --truth FILE"
             )
         i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
-        estimate, reference = found.poses[i], true_track[j]
+        known = np.isfinite(true_track[j, 0])
+        estimate, reference = found.poses[i[known]], true_track[j[known]]
     if len(estimate) < 2:
         check = "" if truth is None else f"; is {truth} the truth of this track?"
         raise RunError(
@@ -74,13 +78,14 @@ def evaluate(
             f"{len(estimate)} of {counted(n_frames, 'frame')} have a true pose; "
             "the errors are over those"
         )
+    absolute = absolute_trajectory_error(estimate[:, :2], reference[:, :2], align)
+    if not np.isfinite(reference[:, 2]).all():
+        if on_note is not None:
+            on_note("the truth has no headings; there is no relative error")
+        return [("absolute (ATE)", absolute, "m")]
     relative = relative_pose_error(estimate, reference)
     return [
-        (
-            "absolute (ATE)",
-            absolute_trajectory_error(estimate[:, :2], reference[:, :2], align),
-            "m",
-        ),
+        ("absolute (ATE)", absolute, "m"),
         ("relative, per frame", relative.translation_m, "m"),
         ("relative, per frame", relative.rotation_rad, "rad"),
     ]

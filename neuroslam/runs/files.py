@@ -52,6 +52,7 @@ class RunPlan:
     stop: int | None = None
     on_bad_frame: OnBadFrame = "stop"
     maps: tuple[str, ...] = ()
+    truth: str = ""
 
     @property
     def name(self) -> str:
@@ -71,6 +72,8 @@ class RunPlan:
         lines.append(f'on_bad_frame = "{self.on_bad_frame}"')
         if self.maps:
             lines.append(f"maps = {json.dumps(self.maps, ensure_ascii=False)}")
+        if self.truth:
+            lines.append(f"truth = {json.dumps(self.truth, ensure_ascii=False)}")
         return "\n".join(["\n[run]", *lines]) + "\n"
 
 

@@ -316,7 +316,7 @@ def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport)
         if truth is None:
             return
         track = trajectory(brain, trace)
-        on = np.isfinite(track[:, 0])
+        on = np.isfinite(track[:, 0]) & np.isfinite(truth[:, 0])
         tracks.append(track[on, :2])
         truths.append(truth[on, :2])
     try:

@@ -215,9 +215,13 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
 
 
 def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return the true pose of every frame, ``(frames, 3)``; ``None`` if one is unknown."""
+    """Return the true pose of every frame, ``(frames, 3)``; ``None`` if none is known.
+
+    A frame without a true position is a row of NaN; an unknown heading alone is NaN.
+    """
     truth = np.column_stack([trace[f"truth_{name}"] for name in ("x_m", "y_m", "theta_rad")])
-    return truth if np.isfinite(truth).all() else None
+    known = np.isfinite(truth[:, :2]).all(axis=1)
+    return truth if known.any() else None
 
 
 def track_file(out: Path) -> Path:

@@ -110,14 +110,20 @@ def write_results(
     tables = gathered(brain.populations.values(), tables_of)
     summary.tables = list(tables)
     if truth is not None:
+        known = on_map & np.isfinite(truth[:, 0])
         # A robot that did not move: the alignment with the truth is undetermined.
         with contextlib.suppress(MapError):
             summary.accuracy = {
                 f"{name}_rmse_m": absolute_trajectory_error(
-                    xy[on_map, :2], truth[on_map, :2], "rigid"
+                    xy[known, :2], truth[known, :2], "rigid"
                 ).rmse
                 for name, xy in (("ate", track), ("odometry_ate", odometry))
             }
+            if plan.truth:  # a lone camera has no metres: also with a free scale
+                summary.accuracy["ate_similarity_rmse_m"] = absolute_trajectory_error(
+                    track[known, :2], truth[known, :2], "similarity"
+                ).rmse
+                summary.accuracy["frames_with_truth"] = int(known.sum())
     try:
         # First what cannot be derived again, so that a run killed now can still be resumed.
         save_run(brain, plan, out, summary)

@@ -28,6 +28,7 @@ from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
+from neuroslam.runs.truth import WithTruth
 from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
@@ -85,6 +86,7 @@ def run(
     *,
     maps: Sequence[str | Path] = (),
     landmarks: str | Path | None = None,
+    truth: str | Path | None = None,
     preset: str = "",
     start: int = 0,
     stop: int | None = None,
@@ -106,6 +108,8 @@ def run(
         landmarks: File of names and attributes of landmarks, of walls and regions, see
             :func:`~neuroslam.sensors.landmarks.read_landmarks`; they replace those that the source
             has. They are stored in the brain.
+        truth: File of true positions, see :func:`~neuroslam.runs.truth.read_truth`, for figures and
+            errors; the brain never sees it. It replaces what the source knows.
         preset: Name of the preset of the config, stored with the session.
         start: First frame of the source.
         stop: Frame to stop before; default: the end.
@@ -123,7 +127,8 @@ def run(
         and ``failure`` holds the error.
 
     Raises:
-        SourceError: If the source cannot be opened, or the words of landmarks cannot be read.
+        SourceError: If the source cannot be opened, or the words of landmarks or the truth cannot
+            be read.
         CheckpointError: If a stored map cannot be loaded.
         ConfigError: If a stored map was made with another config.
         RunError: If the range holds no usable frame, or there are words and no semantic map; or if
@@ -133,7 +138,8 @@ def run(
     if start < 0 or (stop is not None and stop <= start):
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
     paths = tuple(_absolute(brain_file(path)) for path in maps)
-    plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths)
+    true_file = "" if truth is None else str(Path(truth).resolve())
+    plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths, true_file)
     require_free(out, plan.source, overwrite)
     if any(Path(path).parent == out.resolve() for path in paths):
         raise RunError(
@@ -142,7 +148,7 @@ def run(
     words = () if landmarks is None else read_landmarks(landmarks)
     stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
     config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
-    opened = open_source(source, config.frame_rate_hz)
+    opened = _opened(source, plan, config.frame_rate_hz)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(
             f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
@@ -170,6 +176,12 @@ def run(
             )
         summary.unused = list(opened.unused)
         return write_results(brain, plan, out, summary)
+
+
+def _opened(source: str | Path, plan: RunPlan, frame_rate_hz: float) -> Source:
+    """Open the source of a run, with the truth of its file, if it has one."""
+    opened = open_source(source, frame_rate_hz)
+    return WithTruth(opened, plan.truth) if plan.truth else opened
 
 
 def _name_landmarks(
@@ -219,7 +231,7 @@ def resume(
     seen, first = brain.clock.frames_seen, brain.clock.frame + 1
     if stop is not None and stop < first:
         raise RunError(f"{out}: is at frame {first}; expected --stop of at least that, got {stop}")
-    opened = open_source(plan.source, brain.config.frame_rate_hz)
+    opened = _opened(plan.source, plan, brain.config.frame_rate_hz)
     summary = read_summary(out)
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))

@@ -481,7 +481,7 @@ def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
 def test_evaluate_asks_for_a_truth_where_there_is_none(finished, tmp_path, call, mistake):
     source = motion(tmp_path / "log.csv", LINES)
     assert call("run", source, "-o", tmp_path / "run", QUICK).code == 0
-    assert "give a TUM file with --truth FILE" in mistake("evaluate", tmp_path / "run")
+    assert "give a TUM file or CSV with --truth FILE" in mistake("evaluate", tmp_path / "run")
     assert "nowhere.tum" in mistake("evaluate", tmp_path / "run", "--truth", "nowhere.tum")
     assert "--align rgid: expected one of " in mistake("evaluate", finished, "--align", "rgid")
     (tmp_path / "run" / "trace.f64").write_bytes(b"12345")
