@@ -23,6 +23,7 @@ _LEAST_SPREAD = 0.08  # of normals: parallel walls leave the alignment open alon
 _TURNS = 12
 _CANDIDATES = 20_000
 _ROUNDS = 12
+_QUERIES = 50_000  # feet looked up at once: bounds the memory
 
 
 class Outline(NamedTuple):
@@ -85,7 +86,7 @@ def align_outlines(
         step = max(reach_m / 2.0, math.sqrt(np.prod(high - low + reach_m) / _CANDIDATES))
         axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
         moves = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        scores = np.array([_score(tree, loaded, turned, move, reach_m) for move in moves])
+        scores = _scores(tree, loaded, turned, moves, reach_m)
         for k in np.argsort(-scores, kind="stable")[:_ROUNDS]:
             tried.append((int(scores[k]), turn, moves[k]))
     tried.sort(key=lambda row: -row[0])
@@ -102,12 +103,20 @@ def align_outlines(
     return best._replace(runner_up=max(away, default=0))
 
 
-def _score(tree: KDTree, loaded: Outline, turned: Outline, move: np.ndarray, reach_m: float) -> int:
-    away, found = tree.query(turned.feet_m + move, distance_upper_bound=reach_m)
-    nearest = np.asarray(found)
-    met = np.isfinite(away)
-    bearings = loaded.bearing_rad[nearest[met]]
-    return int((np.abs(wrap_angles(turned.bearing_rad[met] - bearings)) < _BEARING_RAD).sum())
+def _scores(
+    tree: KDTree, loaded: Outline, turned: Outline, moves: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """Count the walls that match after each displacement, shape ``(moves,)``."""
+    scores = []
+    at_once = max(1, _QUERIES // len(turned.feet_m))
+    for k in range(0, len(moves), at_once):
+        feet = turned.feet_m + moves[k : k + at_once, None]
+        away, nearest = tree.query(feet, distance_upper_bound=reach_m)
+        met = np.isfinite(away)  # where nothing is near, the index is one past the last
+        bearings = loaded.bearing_rad[np.where(met, nearest, 0)]
+        alike = np.abs(wrap_angles(turned.bearing_rad - bearings)) < _BEARING_RAD
+        scores.append((met & alike).sum(1))
+    return np.concatenate(scores)
 
 
 def _refine(

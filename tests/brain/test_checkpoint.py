@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,9 +25,14 @@ WORLD = "world:corridor?laps=2&noise=0.05"
 CONFIG = BrainConfig(max_gap_s=5.0, map={"rest_tolerance": 0.0})
 
 
+@cache
+def rendered() -> list[Frame]:
+    return list(open_source(WORLD).frames(0, 360))
+
+
 def lived(frames: int) -> NavigationBrain:
     brain = NavigationBrain(CONFIG)
-    for frame in open_source(WORLD).frames(0, frames):
+    for frame in rendered()[:frames]:
         brain(frame)
     return brain
 

@@ -37,8 +37,8 @@ def renumbered(frames, dt_s):
     return [f._replace(index=i, time_s=i * dt_s) for i, f in enumerate(frames)]
 
 
-ROUND = "arena:circle2m?minutes=6&noise=1&seed=1"
-NINE = "arena:nonagon?minutes=6&noise=1&seed=2"
+ROUND = "arena:circle2m?minutes=4&noise=1&seed=1"
+NINE = "arena:nonagon?minutes=4&noise=1&seed=2"
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +56,16 @@ def lived():
 
 @pytest.fixture(scope="module")
 def squares(lived):
-    """Two sessions of five minutes in one square, with other walks and other noise."""
+    """Two sessions of four minutes in one square, with other walks and other noise."""
     return [
-        lived(f"arena:square?minutes=7&noise=1&seed={seed}", 6000, f"square {seed}")[0]
+        lived(f"arena:square?minutes=5.5&noise=1&seed={seed}", 4800, f"square {seed}")[0]
         for seed in (1, 2)
     ]
 
 
 def test_a_life_by_walls_and_motion_maps_the_arena():
     brain = brain_of("slrb")
-    told, truth, lost = lives(brain, open_source("arena:pentagon?minutes=4&noise=1&seed=3"))
+    told, truth, lost = lives(brain, open_source("arena:pentagon?minutes=2.5&noise=1&seed=3"))
     assert absolute_trajectory_error(told, truth, "rigid").rmse < 0.04
     assert not lost.any()
     assert brain.map.n == int(brain.navigation.place.n_cells) > 100
@@ -80,7 +80,9 @@ def test_a_scan_does_as_well_as_walls():
     errors = []
     for sensor in ("", "&ranges=180"):
         brain = brain_of("slrb")
-        told, truth, _ = lives(brain, open_source(f"arena:square?minutes=2&noise=1&seed=4{sensor}"))
+        told, truth, _ = lives(
+            brain, open_source(f"arena:square?minutes=1.2&noise=1&seed=4{sensor}")
+        )
         errors.append(absolute_trajectory_error(told, truth, "rigid").rmse)
     assert max(errors) < 0.04
 
@@ -178,12 +180,16 @@ def test_a_kidnapped_animal_reports_that_it_is_lost_and_learns_nothing(arena):
     assert np.mean(noticed) >= 0.5  # within a minute of walking slowly; the rest met no wall
 
 
-@pytest.mark.parametrize("carried", ["detect", "ignore"])
-def test_a_kidnapped_animal_with_views_relocalises(carried):
+@pytest.fixture(scope="module")
+def kidnapped_drive():
     source = open_source("world:ellipse?laps=3&noise=0.03&ranges=180")
-    frames = list(source.frames(0, 801)) + list(source.frames(1000, 1201))
+    return [*source.frames(0, 801), *source.frames(1000, 1201)]
+
+
+@pytest.mark.parametrize("carried", ["detect", "ignore"])
+def test_a_kidnapped_animal_with_views_relocalises(carried, kidnapped_drive):
     brain = brain_of("ratslam_slrb", sessions={"kidnapped": carried})
-    told, truth, _ = lives(brain, renumbered(frames, 0.1))
+    told, truth, _ = lives(brain, renumbered(kidnapped_drive, 0.1))
     before = align(told[:800], truth[:800])
     off = np.linalg.norm(before.apply(told) - truth, axis=1)
     assert np.median(off[:800]) < 0.6
@@ -217,9 +223,10 @@ def test_views_say_how_the_frames_of_two_sessions_lie():
 
 def test_walls_make_the_map_of_views_better():
     errors = {}
+    frames = list(open_source("world:ellipse?laps=1.3&noise=0.1&ranges=90"))
     for cells in ("pose", "pose_and_place"):
         brain = brain_of("ratslam_slrb", cells=cells)
-        told, truth, _ = lives(brain, open_source("world:ellipse?laps=1.3&noise=0.1&ranges=90"))
+        told, truth, _ = lives(brain, frames)
         errors[cells] = absolute_trajectory_error(told, truth, "rigid").rmse
     assert errors["pose_and_place"] < 0.7 * errors["pose"]
 
@@ -267,12 +274,12 @@ def test_two_sessions_in_one_arena_become_one_map(squares):
 
 
 def test_an_animal_that_continues_after_a_merge_is_localised(squares, lived):
-    _, (told, truth, _) = lived("arena:square?minutes=7&noise=1&seed=1", 6000, "square 1")
+    _, (told, truth, _) = lived("arena:square?minutes=5.5&noise=1&seed=1", 4800, "square 1")
     start = truth[0]
     assert np.linalg.norm(told[-1] + start - truth[-1]) < 0.1
     merged, reports = join_brains(*squares)
     assert merged is not None, reports[0].reason
-    rest = open_source("arena:square?minutes=7&noise=1&seed=2").frames(6000)
+    rest = open_source("arena:square?minutes=5.5&noise=1&seed=2").frames(4800)
     told, truth, lost = lives(merged, rest)
     off = np.linalg.norm(told + start - truth, axis=1)  # in the first session's frame
     assert off.mean() < 0.08
@@ -288,7 +295,7 @@ def test_a_merge_with_itself_adds_nothing(squares):
 
 @pytest.mark.parametrize(
     "other",
-    [*(f"arena:{name}?minutes=3&noise=1&seed=1" for name in ("triangle", "pentagon", "circle1m")),
+    [*(f"arena:{name}?minutes=2&noise=1&seed=1" for name in ("triangle", "pentagon", "circle1m")),
      NINE, ROUND],
 )  # fmt: skip
 def test_maps_of_other_arenas_are_refused_with_the_reason(squares, lived, other):
@@ -350,7 +357,7 @@ def test_brains_with_other_cells_do_not_merge(squares):
 
 def test_merging_from_the_command_line_writes_a_run(tmp_path, call):
     for seed in (1, 2):
-        source = f"arena:square?minutes=2&noise=1&seed={seed}"
+        source = f"arena:square?minutes=1.2&noise=1&seed={seed}"
         run(source, tmp_path / str(seed), brain_of("slrb").config, tensorboard=False)
     done = call("merge", tmp_path / "1", tmp_path / "2", "-o", tmp_path / "both")
     assert done.code == 0, done.out + done.err

@@ -10,9 +10,15 @@ from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.space import SSPSpace
 
 
+def loaded(file):
+    """Read all arrays of a file once: the file itself decompresses one at each access."""
+    with np.load(file) as arrays:
+        return dict(arrays)
+
+
 @pytest.fixture
 def memory_run(shared):
-    return np.load(shared / "refs" / "ssp" / "parity_am.npz")
+    return loaded(shared / "refs" / "ssp" / "parity_am.npz")
 
 
 def as_tensor(array):
@@ -79,7 +85,7 @@ def test_memory_fires_and_learns_as_the_reference(memory_run):
 
 @pytest.fixture
 def integrator_run(shared):
-    return np.load(shared / "refs" / "ssp" / "parity_pi.npz")
+    return loaded(shared / "refs" / "ssp" / "parity_pi.npz")
 
 
 def replayed(ref):
