@@ -129,11 +129,11 @@ def noisy_scans(walk: Walk, seeds: Sequence[int]) -> np.ndarray:
     at = slice(SCAN_EVERY - 1, None, SCAN_EVERY)
     true = arena_of(walk).ranges(walk.positions[at], walk.headings_rad[at], BEAMS, BEAM_REACH_M)
     scans = np.empty((len(seeds), *true.shape))
-    for scan, seed in zip(scans, seeds, strict=True):
+    for i, seed in enumerate(seeds):
         rng = np.random.default_rng([seed, 1])
-        scan[:] = np.maximum(true + BEAM_SIGMA_M * rng.standard_normal(true.shape), 0.0)
+        scans[i] = np.maximum(true + BEAM_SIGMA_M * rng.standard_normal(true.shape), 0.0)
         wrong = rng.random(true.shape) < OUTLIERS
-        scan[wrong] = rng.uniform(0.0, BEAM_REACH_M, int(wrong.sum()))
+        scans[i][wrong] = rng.uniform(0.0, BEAM_REACH_M, int(wrong.sum()))
     return scans
 
 

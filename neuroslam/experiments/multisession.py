@@ -201,14 +201,14 @@ def draw(plan: Plan, result: Result, out: Path, stem: str = "") -> None:
     here, there = runs[-1].brain.map, single.brain.map
     found = map_rmse(here.poses[:, :2], there.poses[:, :2], "rigid")
     diagonal = float(np.linalg.norm(np.ptp(there.poses[:, :2], axis=0)))
-    links = [np.column_stack(one.links[:2]) for one in (there, here)]
     overlay = plot_overlay(
         there.poses[:, :2],
         found.alignment.apply(here.poses[:, :2]),
         found.rmse,
         found.rmse / diagonal,
         f"{plan.title}: merged map over that of the single session",
-        *links,
+        np.column_stack(there.links[:2]),
+        np.column_stack(here.links[:2]),
     )
     save(overlay, out / f"{stem}overlay.png")
     rows = []

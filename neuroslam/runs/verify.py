@@ -83,9 +83,9 @@ def _misfits(state: State, model: NavigationBrain) -> Iterator[str]:
     """Yield the tensors of a state that are missing, unknown, or of a wrong dtype or shape."""
     fresh = {n: t for n, t in model.state_dict().items() if not n.startswith("stored.")}
     for table, module in model.named_modules():
-        own = [f"{table}.{c}" for c in module.columns] if isinstance(module, GrowingTable) else []
-        if own and module.optional and any(name in state for name in own):
-            fresh |= {f"{table}.{c}": module[c][:0] for c in module.columns}
+        if isinstance(module, GrowingTable) and module.optional:
+            own = {f"{table}.{c}": module[c][:0] for c in module.columns}
+            fresh |= own if own.keys() & state.keys() else {}
     for name in sorted(fresh.keys() ^ state.keys()):
         yield f"{name}: {'missing' if name in fresh else 'not part of a brain'}"
     tables = {n: t.columns for n, t in model.named_modules() if isinstance(t, GrowingTable)}
