@@ -1,6 +1,6 @@
 """Types that flow between the stages. SI units; x forward, y left, angles counter-clockwise."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,9 @@ NO_TEMPLATE = -1
 
 NO_EXPERIENCE = -1
 """Experience id before the first experience exists."""
+
+GreyRule = Literal["luma", "mean"]
+"""How colour becomes grey, see :func:`neuroslam.sensors.grey.to_grey`."""
 
 
 class Pose(NamedTuple):

@@ -101,7 +101,7 @@ class BrainState(nn.Module):
     def _begin(self) -> None:
         """Start with an empty map."""
         config, cells = self.config, self.config.pose_cells
-        self.odometry = VisualOdometry(config.odometry)
+        self.odometry = VisualOdometry(config.odometry, config.view.grey)
         self.view = LocalViewCells(config.view, self._encoder)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells

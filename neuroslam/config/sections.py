@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from neuroslam.config.section import Section
 from neuroslam.errors import did_you_mean
+from neuroslam.types import GreyRule
 
 Region = tuple[int, int, int, int]
 """Part of an image: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded; -1 as a maximum is
@@ -87,6 +88,11 @@ class ViewConfig(Section):
     )
     weights: str | None = Field(
         default=None, description="file with the state_dict of the network that features names"
+    )
+    grey: GreyRule = Field(
+        default="luma",
+        description="how colour becomes grey, for views and visual odometry; luma: 0.299 R + "
+        "0.587 G + 0.114 B; mean: (R + G + B) / 3, as in OpenRatSLAM",
     )
     crop: Region | None = Field(
         default=None,

@@ -160,7 +160,7 @@ def run_plan(plan: Plan, overrides: dict[str, Any] | None = None) -> Result:
     """Run all frames in one session, and in several, each with the map of those before."""
     values = merge_values(read_preset(plan.preset) if plan.preset else {}, plan.config)
     config = build_config(merge_values(values, overrides or {}), plan.title)
-    source = open_source(plan.source, config.frame_rate_hz)
+    source = open_source(plan.source, config.frame_rate_hz, config.view.grey)
     if not isinstance(source, IndexedSource):
         raise RunError(f"{plan.source}: is read in order only; expected frames by number")
     single = run_session(source.frames(), config, name=plan.source)

@@ -68,7 +68,8 @@ def plot_map(
         session: Number of the session that made each experience, ``(n,)``, from 0: its colour.
         session_names: Names of the sessions, for the legend; colours repeat after six.
         odometry_of: Name of the session of the odometry, for the legend.
-        planned: Positions of a planned path, ``(p, 2)``.
+        planned: Positions of a planned path, ``(p, 2)``; its start and goal are marked then, and
+            not the first and last experience.
         title: Title of the whole figure.
 
     Raises:

@@ -124,7 +124,9 @@ def draw_map(
         course = np.asarray(planned)
         axes.plot(*course.T, color=OTHER, lw=4.0, alpha=0.8, zorder=5, label="planned path")
         axes.plot(*course[-1], "D", color=OTHER, ms=8, mec=INK, mew=0.8, zorder=8, label="goal")
-    _draw_ends(axes, xy, end=current is None)
+        _draw_ends(axes, course, end=False)  # beside a goal, a start is that of the path
+    else:
+        _draw_ends(axes, xy, end=current is None)
     if current is not None:
         draw_robot(axes, current, "robot now")
     axes.autoscale_view()

@@ -15,9 +15,10 @@ from torch import Tensor
 from neuroslam.config.sections import OdometryConfig, Region, region_in
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.sensors.frames import check_image
+from neuroslam.sensors.grey import to_grey
 from neuroslam.state.mergeable import AboutNow
 from neuroslam.state.tables import Scalars
-from neuroslam.types import Velocity
+from neuroslam.types import GreyRule, Velocity
 
 
 def profile(image: np.ndarray, region: Region) -> np.ndarray:
@@ -138,6 +139,10 @@ class VisualOdometry(AboutNow):
 
     The column sums of the last image's two regions are buffers, so ``state_dict`` is complete.
 
+    Args:
+        config: Regions, field of view and scale.
+        grey: How colour becomes grey; in a brain, ``view.grey``.
+
     Example:
         >>> odometry = VisualOdometry(OdometryConfig(max_shift_px=4))
         >>> image = np.tile(np.array([0, 9, 50, 200, 90, 0, 30, 7], np.uint8), (6, 1))
@@ -150,9 +155,10 @@ class VisualOdometry(AboutNow):
     speed_sums: Tensor
     turn_sums: Tensor
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, grey: GreyRule = "luma") -> None:
         super().__init__()
         self.config = config
+        self.grey: GreyRule = grey
         self.size = _Size(height=0, width=0)
         # Regions are derived from the config and the size of an image.
         self._regions: tuple[tuple[int, int], tuple[Region, Region]] | None = None
@@ -187,8 +193,7 @@ class VisualOdometry(AboutNow):
         if not dt_s > 0.0:
             raise BadFrame(f"VisualOdometry: {dt_s} s since the last image; expected more than 0")
         check_image(image, "VisualOdometry")
-        if image.ndim == 3:
-            image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        image = to_grey(image, self.grey)
         height, width = image.shape
         first = self.size.height == 0
         if not first and (height, width) != (self.size.height, self.size.width):

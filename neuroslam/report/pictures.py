@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 
+from neuroslam.config import BrainConfig
 from neuroslam.errors import SourceError
 from neuroslam.report.reading import FinishedRun, session_plans
 from neuroslam.runs.files import RunPlan
@@ -79,7 +80,7 @@ def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
         if frames:
             sources[run.plan.source].update(_thinned(frames, MOST // 2))
         for spec, numbers in sources.items():
-            found, note = _from_source(spec, sorted(numbers), run.brain.config.frame_rate_hz)
+            found, note = _from_source(spec, sorted(numbers), run.brain.config)
             taken |= {SourceFrame(spec, number): file for number, file in found.items()}
             notes += [note] if note else []
         n_taken, taken = len(taken), _within(taken, budget_bytes)
@@ -113,14 +114,14 @@ def _first_frames(run: FinishedRun) -> tuple[list[SourceFrame | None], int]:
 
 
 def _from_source(
-    spec: str, numbers: list[int], frame_rate_hz: float
+    spec: str, numbers: list[int], config: BrainConfig
 ) -> tuple[dict[int, bytes], str]:
     """Return pictures of these frames, and a note on those that are missing, or nothing."""
     name = RunPlan(spec).name
     found: dict[int, bytes] = {}
     seen, fault = 0, ""
     try:
-        source = open_source(spec, frame_rate_hz)
+        source = open_source(spec, config.frame_rate_hz, config.view.grey)
         if source.live:
             return found, f"No pictures of {name}: a live source cannot be read again."
         for frame in _frames(source, numbers):

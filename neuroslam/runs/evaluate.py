@@ -149,7 +149,7 @@ def compare_maps(
                 found.alignment.apply(ours),
                 found.rmse,
                 rows[0].of_diagonal,
-                "Two maps, aligned by ICP",
+                "Two maps, rigid alignment by ICP",
                 *(np.column_stack([m.links.source, m.links.target]) for m in reversed(maps)),
                 names=(names[0], f"{names[1]}, aligned"),
             )

@@ -148,7 +148,7 @@ def run(
     words = () if landmarks is None else read_landmarks(landmarks)
     stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
     config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
-    opened = _opened(source, plan, config.frame_rate_hz)
+    opened = _opened(source, plan, config)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(
             f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
@@ -178,9 +178,9 @@ def run(
         return write_results(brain, plan, out, summary)
 
 
-def _opened(source: str | Path, plan: RunPlan, frame_rate_hz: float) -> Source:
+def _opened(source: str | Path, plan: RunPlan, config: BrainConfig) -> Source:
     """Open the source of a run, with the truth of its file, if it has one."""
-    opened = open_source(source, frame_rate_hz)
+    opened = open_source(source, config.frame_rate_hz, config.view.grey)
     return WithTruth(opened, plan.truth) if plan.truth else opened
 
 
@@ -231,7 +231,7 @@ def resume(
     seen, first = brain.clock.frames_seen, brain.clock.frame + 1
     if stop is not None and stop < first:
         raise RunError(f"{out}: is at frame {first}; expected --stop of at least that, got {stop}")
-    opened = _opened(plan.source, plan, brain.config.frame_rate_hz)
+    opened = _opened(plan.source, plan, brain.config)
     summary = read_summary(out)
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))

@@ -8,9 +8,10 @@ from pathlib import Path
 import cv2
 
 from neuroslam.errors import BadFrame, SourceError
+from neuroslam.sensors.grey import to_grey
 from neuroslam.sensors.images import quiet_opencv, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
-from neuroslam.types import Frame
+from neuroslam.types import Frame, GreyRule
 
 _MAX_FAILURES = 10
 """Consecutive failed reads after which the camera counts as disconnected."""
@@ -24,12 +25,14 @@ class CameraSource(Source):
 
     Args:
         device: Number of a camera of this machine, or address of a stream.
+        grey: How colour becomes grey.
 
     Raises:
         SourceError: If ``device`` is no number and no address, or the camera cannot be opened.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, grey: GreyRule = "luma") -> None:
+        self.grey: GreyRule = grey
         self.name = f"camera:{device}"
         self.device: int | str = int(device) if device.isdecimal() else device
         self.n_frames = None
@@ -71,7 +74,7 @@ class CameraSource(Source):
                     continue
                 missed = 0
                 time_s = epoch_s + time.monotonic() - began_s
-                grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+                grey = to_grey(image, self.grey, "bgr")
                 shape = shape or grey.shape
                 try:
                     require_shape(grey, shape, self.name, index)

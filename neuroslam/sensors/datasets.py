@@ -28,6 +28,7 @@ from neuroslam.sensors.images import (
     parse_times,
     read_text,
 )
+from neuroslam.types import GreyRule
 
 MAX_GAP_S = 0.1
 """An image farther in time than this from every known pose has no truth."""
@@ -35,23 +36,23 @@ MAX_GAP_S = 0.1
 _KITTI_CAMERAS = ("image_2", "image_0", "image_3", "image_1")
 
 
-def open_dataset(path: Path, frame_rate_hz: float) -> ImageSource | None:
+def open_dataset(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource | None:
     """Open a folder of one of the datasets; ``None`` if it has none of their layouts.
 
     Raises:
         SourceError: If a file of the dataset is missing or damaged.
     """
     if (path / "rgb.txt").is_file():
-        return open_tum(path, frame_rate_hz)
+        return open_tum(path, frame_rate_hz, grey)
     for mav in (path / "mav0", path):
         if (mav / "cam0" / "data.csv").is_file():
-            return open_euroc(mav, frame_rate_hz)
+            return open_euroc(mav, frame_rate_hz, grey)
     if any((path / camera).is_dir() for camera in _KITTI_CAMERAS):
-        return open_kitti(path, frame_rate_hz)
+        return open_kitti(path, frame_rate_hz, grey)
     return None
 
 
-def open_tum(path: Path, frame_rate_hz: float) -> ImageSource:
+def open_tum(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open a folder of the TUM RGB-D benchmark.
 
     Raises:
@@ -69,10 +70,12 @@ def open_tum(path: Path, frame_rate_hz: float) -> ImageSource:
         forward = _rotated(rows[:, 4:8], np.array([0.0, 0.0, 1.0]))
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
         truth = at_times(rows[:, 0], poses, times)
-    return ImageSource(str(path), images.images, times, images.clock.frame_rate_hz, truth=truth)
+    return ImageSource(
+        str(path), images.images, times, images.clock.frame_rate_hz, truth=truth, grey=grey
+    )
 
 
-def open_kitti(path: Path, frame_rate_hz: float) -> ImageSource:
+def open_kitti(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open a sequence of the KITTI odometry benchmark.
 
     Raises:
@@ -96,10 +99,10 @@ def open_kitti(path: Path, frame_rate_hz: float) -> ImageSource:
             truth = _on_ground(rows[:, 11], -rows[:, 3], rows[:, 10], -rows[:, 2])
             break
     images = [ImageFile(name, folder / name) for name in names]
-    return ImageSource(str(path), images, times, frame_rate_hz, truth=truth)
+    return ImageSource(str(path), images, times, frame_rate_hz, truth=truth, grey=grey)
 
 
-def open_euroc(mav: Path, frame_rate_hz: float) -> ImageSource:
+def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open the left camera of a ``mav0`` folder of the EuRoC MAV dataset.
 
     Raises:
@@ -126,7 +129,7 @@ def open_euroc(mav: Path, frame_rate_hz: float) -> ImageSource:
         forward = _rotated(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
         truth = at_times(rows[:, 0] * 1e-9, poses, times)
-    return ImageSource(str(mav.parent), images, times, frame_rate_hz, truth=truth)
+    return ImageSource(str(mav.parent), images, times, frame_rate_hz, truth=truth, grey=grey)
 
 
 def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray) -> np.ndarray:

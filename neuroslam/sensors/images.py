@@ -23,9 +23,10 @@ import cv2
 import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
+from neuroslam.sensors.grey import to_grey
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.tracks import Clock, Track, parse_motion
-from neuroslam.types import Frame, Pose
+from neuroslam.types import Frame, GreyRule, Pose
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
@@ -60,6 +61,7 @@ class ImageSource(IndexedSource):
         frame_rate_hz: Frames per second if there are no times.
         motion: Measured motion, one row per image.
         truth: True poses, ``(n, 3)``, NaN where unknown; ``None``: those of the motion, if any.
+        grey: How colour becomes grey.
 
     Raises:
         SourceError: If no image can be decoded, or the number of times or of motions differs from
@@ -74,8 +76,10 @@ class ImageSource(IndexedSource):
         frame_rate_hz: float,
         motion: Track | None = None,
         truth: np.ndarray | None = None,
+        grey: GreyRule = "luma",
     ) -> None:
         self.name = name
+        self.grey: GreyRule = grey
         self.truth = truth if truth is not None or motion is None else motion.truth
         self.images = images
         self.n_frames = len(images)
@@ -102,7 +106,7 @@ class ImageSource(IndexedSource):
     def _decoded(self, index: int) -> np.ndarray:
         file = self.images[index]
         try:
-            image = decode_grey(file.read())
+            image = decode_grey(file.read(), self.grey)
         except OSError as error:
             raise BadFrame(
                 f"{self.name}: frame {index}: {file.name} cannot be read ({error.strerror})"
@@ -145,7 +149,7 @@ def require_shape(
         )
 
 
-def decode_grey(data: bytes) -> np.ndarray | None:
+def decode_grey(data: bytes, rule: GreyRule = "luma") -> np.ndarray | None:
     """Decode an image to grey by way of colour, as a JPEG's own luminance is rounded differently.
 
     Returns:
@@ -162,7 +166,7 @@ def decode_grey(data: bytes) -> np.ndarray | None:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:
             return None
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return None if image is None else to_grey(image, rule, "bgr")
 
 
 def _is_complete(data: bytes) -> bool:
@@ -191,7 +195,7 @@ def quiet_opencv() -> Iterator[None]:
         log.setLogLevel(before)
 
 
-def open_folder(path: Path, frame_rate_hz: float) -> ImageSource:
+def open_folder(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open a folder of images.
 
     Raises:
@@ -200,10 +204,10 @@ def open_folder(path: Path, frame_rate_hz: float) -> ImageSource:
     files = {file.name: file for file in path.iterdir() if file.is_file()}
     images = [ImageFile(name, file) for name, file in files.items() if is_image_name(name)]
     notes = {name: read_text(file) for name, file in files.items() if name in _NOTES}
-    return _with_notes(str(path), images, notes, frame_rate_hz)
+    return _with_notes(str(path), images, notes, frame_rate_hz, grey)
 
 
-def open_tar(path: Path, frame_rate_hz: float) -> ImageSource:
+def open_tar(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open a tar of images; nothing is unpacked to disk.
 
     The images of a plain tar are read in place; those of a compressed tar are kept in memory,
@@ -228,7 +232,7 @@ def open_tar(path: Path, frame_rate_hz: float) -> ImageSource:
         for member in members
         if (note := member.name.rpartition("/")[2]) in _NOTES
     }
-    return _with_notes(str(path), images, notes, frame_rate_hz)
+    return _with_notes(str(path), images, notes, frame_rate_hz, grey)
 
 
 def _list_tar(path: Path, mode: Literal["r:", "r:*"]) -> list[ImageFile]:
@@ -245,7 +249,7 @@ def _list_tar(path: Path, mode: Literal["r:", "r:*"]) -> list[ImageFile]:
     return list(found.values())
 
 
-def open_image_list(path: Path, frame_rate_hz: float) -> ImageSource:
+def open_image_list(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
     """Open an image list; the module's docstring describes its format.
 
     Raises:
@@ -259,7 +263,8 @@ def open_image_list(path: Path, frame_rate_hz: float) -> ImageSource:
         raise SourceError(
             f"{path}: {without} has no time, but others do; expected a time for all or none"
         )
-    return ImageSource(str(path), images, None if None in times else np.array(times), frame_rate_hz)
+    known = None if None in times else np.array(times)
+    return ImageSource(str(path), images, known, frame_rate_hz, grey=grey)
 
 
 def parse_image_list(text: str, name: str) -> list[tuple[str, float | None]]:
@@ -330,7 +335,11 @@ _NOTES = ("times.txt", "times.csv", "odometry.csv")
 
 
 def _with_notes(
-    name: str, images: list[ImageFile], notes: dict[str, str], frame_rate_hz: float
+    name: str,
+    images: list[ImageFile],
+    notes: dict[str, str],
+    frame_rate_hz: float,
+    grey: GreyRule,
 ) -> ImageSource:
     if not images:
         raise SourceError(
@@ -344,6 +353,7 @@ def _with_notes(
         None if times is None else parse_times(notes[times], f"{name}: {times}"),
         frame_rate_hz,
         None if motion is None else parse_motion(motion, f"{name}: odometry.csv"),
+        grey=grey,
     )
 
 

@@ -20,6 +20,7 @@ from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import TrackSource, parse_motion, read_positions, read_track
 from neuroslam.sensors.video import VIDEO_SUFFIXES, VideoSource
+from neuroslam.types import GreyRule
 
 DEFAULT_FRAME_RATE_HZ = 20.0
 
@@ -32,7 +33,9 @@ _KINDS = (
 _PREFIXES = ("world:", "arena:", "camera:")
 
 
-def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
+def open_source(
+    spec: str | Path, frame_rate_hz: float | None = None, grey: GreyRule = "luma"
+) -> Source:
     """Open the source that ``spec`` names.
 
     ==================================  ========================================================
@@ -55,6 +58,7 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
     Args:
         spec: A path, or ``kind:name``.
         frame_rate_hz: Frames per second if the source has no times; ``None``: 20.
+        grey: How the colour of recordings and cameras becomes grey.
 
     Raises:
         SourceError: If the source is missing, of no known kind, or cannot be read.
@@ -71,7 +75,7 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
         raise SourceError(f"the name of the source is empty; expected {_KINDS}")
     try:
         if parts := _parts(str(spec)):
-            return Streams(*(open_source(part, frame_rate_hz) for part in parts))
+            return Streams(*(open_source(part, frame_rate_hz, grey) for part in parts))
         if isinstance(spec, str) and spec.startswith("world:"):
             from neuroslam.worlds.world import open_world  # here: worlds import this package
 
@@ -81,16 +85,16 @@ def open_source(spec: str | Path, frame_rate_hz: float | None = None) -> Source:
 
             return open_arena(spec)
         if isinstance(spec, str) and spec.startswith("camera:"):
-            return CameraSource(spec.removeprefix("camera:"))
+            return CameraSource(spec.removeprefix("camera:"), grey)
         path, topics = _bag_topics(str(spec))
         if is_bag(path) and path.exists():
-            return open_bag(path, topics)
+            return open_bag(path, topics, grey)
         path = Path(spec)
         if not path.exists():
             if "://" in str(spec):
                 raise SourceError(f"{spec}: is an address; open it as a camera: camera:{spec}")
             raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
-        return _opener(path)(path, rate)
+        return _opener(path)(path, rate, grey)
     except OSError as error:
         raise SourceError(f"{spec}: cannot be read ({error.strerror or error})") from None
 
@@ -165,7 +169,7 @@ def _exists(part: str) -> bool:
     return part != "" and Path(part).exists()
 
 
-def _opener(path: Path) -> Callable[[Path, float], Source]:
+def _opener(path: Path) -> Callable[[Path, float, GreyRule], Source]:
     name = path.name.lower()
     if path.is_dir():
         return _open_folder
@@ -181,21 +185,21 @@ def _opener(path: Path) -> Callable[[Path, float], Source]:
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
 
 
-def _open_folder(path: Path, frame_rate_hz: float) -> Source:
+def _open_folder(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     """Open a folder as a dataset if it has the layout of one, else as a folder of images."""
-    return open_dataset(path, frame_rate_hz) or open_folder(path, frame_rate_hz)
+    return open_dataset(path, frame_rate_hz, grey) or open_folder(path, frame_rate_hz, grey)
 
 
-def _open_table(path: Path, frame_rate_hz: float) -> Source:
+def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     """Open a text file: an image list if one of its first lines names an image, else motion."""
     text = read_text(path)
     for row in csv.reader(text.splitlines()[:10]):
         if any(is_image_name(word) for field in row for word in field.split()):
-            return open_image_list(path, frame_rate_hz)
+            return open_image_list(path, frame_rate_hz, grey)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
 
 
-def _open_positions(path: Path, frame_rate_hz: float) -> Source:
+def _open_positions(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
     """Open a track, and its walls if it has an arena."""
     from neuroslam.worlds.rodent import ARENA_KEYS, read_walk
     from neuroslam.worlds.senses import ArenaSource

@@ -15,11 +15,12 @@ import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI, wrap_angles
+from neuroslam.sensors.grey import to_grey
 from neuroslam.sensors.images import decode_grey, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import time_text
-from neuroslam.types import Frame, Velocity
+from neuroslam.types import Frame, GreyRule, Velocity
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 KINDS = {
@@ -48,7 +49,20 @@ _GREY = {
     "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
 }
-"""For each encoding: type and number of channels of a pixel, and its conversion to grey."""
+"""For each encoding: type and number of channels of a pixel, and its conversion to luma."""
+
+_BGR = {
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "8UC4": cv2.COLOR_BGRA2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "yuv422": cv2.COLOR_YUV2BGR_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+}
+"""Conversion of an encoding to three channels of colour, where it has not just those."""
 
 
 def is_bag(path: Path) -> bool:
@@ -56,12 +70,13 @@ def is_bag(path: Path) -> bool:
     return path.name.lower().endswith(BAG_SUFFIXES) or (path / "metadata.yaml").is_file()
 
 
-def open_bag(path: Path, topics: dict[str, str] | None = None) -> Source:
+def open_bag(path: Path, topics: dict[str, str] | None = None, grey: GreyRule = "luma") -> Source:
     """Open a bag: its camera, its odometry, or both merged by time.
 
     Args:
         path: File or folder.
         topics: Topic by kind (see ``KINDS``); by default the first of each kind.
+        grey: How colour becomes grey.
 
     Raises:
         SourceError: If ``rosbags`` is not installed, the bag is damaged, or it lacks a topic.
@@ -85,7 +100,7 @@ def open_bag(path: Path, topics: dict[str, str] | None = None) -> Source:
     if (topic := chosen["odometry"]) is not None:
         motion = BagMotion(path, topic, chosen["scan"], counts[topic])
     if (topic := chosen["image"]) is not None:
-        camera = BagCamera(path, topic, counts[topic])
+        camera = BagCamera(path, topic, counts[topic], grey)
     if camera is not None and motion is not None:
         return Streams(camera, motion)
     return cast(Source, camera or motion)  # one is there, as checked above
@@ -184,15 +199,16 @@ class _BagTopic(Source):
 class BagCamera(_BagTopic):
     """The images of one topic, in grey."""
 
-    def __init__(self, path: Path, topic: str, n_messages: int) -> None:
+    def __init__(self, path: Path, topic: str, n_messages: int, grey: GreyRule = "luma") -> None:
         super().__init__(path, (topic,), n_messages)
+        self.grey: GreyRule = grey
         self._begin()
 
     def _begin(self) -> None:
         self.shape: tuple[int, ...] | None = None
 
     def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
-        image = _grey(message, self.name, index)
+        image = _grey(message, self.name, index, self.grey)
         self.shape = self.shape or image.shape
         require_shape(image, self.shape, self.name, index)
         return Frame(index, time_s, image=image)
@@ -259,9 +275,9 @@ def _time_s(message: Any, received_ns: int) -> float:  # noqa: ANN401
     return stamped if stamped > 0.0 else received_ns * 1e-9
 
 
-def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
+def _grey(message: Any, name: str, index: int, rule: GreyRule) -> np.ndarray:  # noqa: ANN401
     if hasattr(message, "format"):
-        image = decode_grey(bytes(message.data))
+        image = decode_grey(bytes(message.data), rule)
         if image is None:
             raise BadFrame(f"{name}: frame {index}: its {message.format} image is corrupt")
         return image
@@ -283,4 +299,9 @@ def _grey(message: Any, name: str, index: int) -> np.ndarray:  # noqa: ANN401
     pixels = rows.view(dtype).reshape((h, w) if channels == 1 else (h, w, channels))
     if dtype.itemsize == 2:
         return (pixels >> 8).astype(np.uint8)
-    return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
+    if conversion is None:
+        return pixels.copy()
+    if rule == "luma":  # in one step, without rounding in between
+        return cv2.cvtColor(pixels, conversion)
+    to_bgr = _BGR.get(message.encoding)
+    return to_grey(pixels if to_bgr is None else cv2.cvtColor(pixels, to_bgr), rule)

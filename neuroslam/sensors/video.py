@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 
 from neuroslam.errors import BadFrame, SourceError, counted
+from neuroslam.sensors.grey import to_grey
 from neuroslam.sensors.images import quiet_opencv, require_shape
 from neuroslam.sensors.source import OnBadFrame, Source
-from neuroslam.types import Frame
+from neuroslam.types import Frame, GreyRule
 
 VIDEO_SUFFIXES = (
     *(".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts"),
@@ -29,12 +30,14 @@ class VideoSource(Source):
     Args:
         path: The file.
         frame_rate_hz: Frame rate, if the container states none.
+        grey: How colour becomes grey.
 
     Raises:
         SourceError: If the file is not a video or has no frames.
     """
 
-    def __init__(self, path: Path, frame_rate_hz: float) -> None:
+    def __init__(self, path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> None:
+        self.grey: GreyRule = grey
         self.path = Path(path)
         self.name = str(path)
         with self._capture() as capture:
@@ -93,8 +96,7 @@ class VideoSource(Source):
         if not decoded:
             raise BadFrame(f"{self.name}: frame {index} cannot be decoded")
         require_shape(image[..., 0], self.image_shape, self.name, index)
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        return Frame(index, index / self._rate_hz, image=grey)
+        return Frame(index, index / self._rate_hz, image=to_grey(image, self.grey, "bgr"))
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:

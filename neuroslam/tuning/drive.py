@@ -9,7 +9,8 @@ import numpy as np
 from neuroslam.config.sections import Region
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors import Source
-from neuroslam.types import Frame
+from neuroslam.sensors.grey import to_grey
+from neuroslam.types import Frame, GreyRule
 from neuroslam.view.features import FeatureEncoder
 from neuroslam.view.preprocess import Encoded
 from neuroslam.view.templates import to_bytes
@@ -97,7 +98,10 @@ class Drive:
 
 
 def read_drive(
-    source: Source, stop: int | None = None, encoder: FeatureEncoder | None = None
+    source: Source,
+    stop: int | None = None,
+    encoder: FeatureEncoder | None = None,
+    grey: GreyRule = "luma",
 ) -> Drive:
     """Read a source once and reduce its pictures; unusable frames are left out.
 
@@ -105,6 +109,7 @@ def read_drive(
         source: A recording, not a live source.
         stop: Frame to stop before.
         encoder: Network that makes the templates; ``None`` for grey templates.
+        grey: How colour becomes grey.
 
     Raises:
         SourceError: If fewer than a hundred frames have a picture.
@@ -128,7 +133,7 @@ def read_drive(
                 faults.append(fault)
                 continue
             views[frame.index] = view._replace(template=to_bytes(view.template))
-        frames.append(frame._replace(image=_reduced(frame.image, factor)))
+        frames.append(frame._replace(image=_reduced(to_grey(frame.image, grey), factor)))
         if len(frames) == MAX_FRAMES:
             break
     if len(frames) < _MIN_FRAMES:
@@ -139,8 +144,7 @@ def read_drive(
     return Drive(frames, factor, size, len(faults), None if encoder is None else views)
 
 
-def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+def _reduced(grey: np.ndarray, factor: int) -> np.ndarray:
     height, width = grey.shape[0] // factor, grey.shape[1] // factor
     if factor == 1:
         return grey

@@ -166,7 +166,7 @@ def tune(
         raise RunError(f"{out}: is a file; expected a folder to write")
     if (out / "config.toml").exists() and not overwrite:
         raise RunError(f"{out}: holds a config.toml already; take another folder or --overwrite")
-    opened = open_source(source, config.frame_rate_hz)
+    opened = open_source(source, config.frame_rate_hz, config.view.grey)
     if opened.live:
         raise RunError(
             f"{opened.name}: is live; tuning reads its source several times, so tune on a recording"
@@ -194,7 +194,7 @@ def _tune(
 ) -> Tuning:
     report("reading")
     encoder = None if config.view.features == "grey" else FeatureEncoder(config.view, features)
-    drive = read_drive(source, stop, encoder)
+    drive = read_drive(source, stop, encoder, config.view.grey)
     keys = key_frames(drive)
     report("finding revisits")
     revisits = find_revisits(drive.pictures[keys])

@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate, pad
 from neuroslam.config import ViewConfig
 from neuroslam.errors import BadFrame, ConfigError, first_line
 from neuroslam.sensors.frames import check_image
+from neuroslam.sensors.grey import to_grey
 from neuroslam.state.files import tensors_digest
 from neuroslam.view import vision
 from neuroslam.view.preprocess import Encoded, crop, encode
@@ -125,7 +126,7 @@ class FeatureEncoder:
         )
         contrast = 1.0
         if config.min_contrast:
-            grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+            grey = to_grey(rgb, config.grey)
             small = cv2.resize(grey, _SMALL_PX, interpolation=cv2.INTER_AREA)
             contrast = float(small.std()) / 255.0
         return Encoded(template.numpy(force=True), contrast)

@@ -10,6 +10,7 @@ from neuroslam.config import ViewConfig
 from neuroslam.config.sections import region_in
 from neuroslam.errors import ConfigError
 from neuroslam.sensors.frames import check_image
+from neuroslam.sensors.grey import to_grey
 
 
 class Encoded(NamedTuple):
@@ -29,7 +30,7 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-        config: Crop, size and normalisation.
+        config: Rule of grey, crop, size and normalisation.
 
     Raises:
         BadFrame: If the image has another type or shape.
@@ -44,8 +45,7 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         [4.5, 6.5, 8.5, 10.5]
     """
     check_image(image, "LocalViewCells")
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    image = to_grey(image, config.grey)
     view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
     contrast = float(view.std()) if config.min_contrast else 1.0
     if config.normalisation:

@@ -106,7 +106,7 @@ class WorldOptions(BaseModel):
     panoramic: bool | None = Field(
         default=None, description="panoramic camera; none: the world's default"
     )
-    grey: bool = Field(default=False, description="one channel instead of RGB")
+    grey: bool = Field(default=False, description="one channel, luma, instead of RGB")
     look: int = Field(default=0, ge=0, description="seed of the textures")
     seed: int = Field(default=0, ge=0, description="seed of odometry noise, light and pedestrians")
     noise: float = Field(

@@ -231,6 +231,15 @@ def test_experiences_and_links_have_the_colour_of_their_session():
     assert left.get_legend().get_texts()[0].get_text() == "odometry of tuesday.mp4"
 
 
+def test_a_planned_path_is_marked_at_its_own_start_and_at_its_goal():
+    figure = maps.plot_map(SQUARE, RING, current=Pose(1.0, 2.0, 0.0), planned=SQUARE[[2, 1], :2])
+    (axes,) = figure.get_axes()
+    marks = {line.get_label(): line.get_xydata().tolist() for line in axes.get_lines()}
+    assert marks["start"] == [SQUARE[2, :2].tolist()]
+    assert marks["goal"] == [SQUARE[1, :2].tolist()]
+    assert "end" not in marks
+
+
 def test_a_truth_that_does_not_fit_the_track_is_refused():
     with pytest.raises(ValueError, match="truth_xy has 7 points and the track 4; give track_xy"):
         maps.plot_map(SQUARE, RING, truth_xy=np.zeros((7, 2)))
