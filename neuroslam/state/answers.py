@@ -127,7 +127,7 @@ def gathered(
         >>> cells = pose.build(BrainConfig(), pose)
         >>> list(gathered([cells], scalars_of))
         ['cells/peak']
-        >>> gathered([cells, cells], scalars_of)
+        >>> gathered([cells, cells], scalars_of)  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         TypeError: PoseCellNetwork and PoseCellNetwork: both name one of their scalars() ...
     """
