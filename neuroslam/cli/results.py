@@ -10,7 +10,7 @@ from rich.table import Table
 from neuroslam.cli.options import Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
-from neuroslam.errors import counted
+from neuroslam.errors import RunError, counted
 
 if TYPE_CHECKING:
     from neuroslam.evaluation.trajectory import AlignmentMode
@@ -159,6 +159,10 @@ def evaluate_command(
     """Compare a trajectory with the ground truth, or a map with that of another run."""
     from neuroslam.runs.evaluate import compare_maps, evaluate
 
+    if against is None and to is not None:
+        raise RunError("--out: is the figure of --against RUN; give both, or neither")
+    if against is not None and truth is not None:
+        raise RunError("--against: compares two maps, --truth a trajectory; give one of them")
     if against is not None:
         table = Table(title=f"Experiences of {track} aligned with those of {against} by ICP")
         for column in ("alignment", "RMSE (m)", "of the diagonal (%)", "rotation (°)", "scale"):

@@ -140,7 +140,8 @@ def noisy_scans(walk: Walk, seeds: Sequence[int]) -> np.ndarray:
 def with_scans(motion: Senses, scans: np.ndarray, condition: str) -> Senses:
     """Return the senses with the walls that are found in the scans, the nearest ``WALLS``.
 
-    The detector of lines is told the noise of the beams; its default finds hardly any wall.
+    :func:`walls_in_scan` has the noise of the beams as its tolerance; with its default it finds
+    hardly any wall.
     """
     sheet = BoundarySheet(BoundaryCellConfig())
     raw = partial(walls_in_scan, reach_m=REACH_M, tolerance_m=BEAM_SIGMA_M)

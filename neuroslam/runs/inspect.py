@@ -87,12 +87,11 @@ def write_tables(path: str | Path, out: str | Path) -> list[Path]:
 
     Raises:
         CheckpointError: If the brain cannot be read.
-        RunError: If ``out`` is a file.
+        RunError: If ``out`` is a file, or cannot be written.
     """
     brain, out = load_brain(brain_file(path)), Path(out)
     if out.is_file():
         raise RunError(f"{out}: is a file; expected a folder to write tables into")
-    out.mkdir(parents=True, exist_ok=True)
     texts: dict[str, str] = {}
     for name, part in brain.named_modules():
         if isinstance(part, GrowingTable):
@@ -103,8 +102,12 @@ def write_tables(path: str | Path, out: str | Path) -> list[Path]:
             lines = [f"{cell},{rate!r}" for cell, rate in rates]
             texts[f"{population.name}.rates.csv"] = "\n".join(["cell,rate", *lines]) + "\n"
         texts |= population.tables()
-    for name, text in texts.items():
-        write_text(out / name, text)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            write_text(out / name, text)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return [out / name for name in texts]
 
 

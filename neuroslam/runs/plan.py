@@ -1,6 +1,6 @@
 """The quickest path from the robot, or any experience, to another experience of a map."""
 
-import re
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +11,6 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import save
 from neuroslam.runs.files import brain_file, write_text
-
-_PLACE = re.compile(r"\s*(-?[\d.]+(?:e-?\d+)?)\s*,\s*(-?[\d.]+(?:e-?\d+)?)\s*")
 
 
 class PlannedPath(NamedTuple):
@@ -92,13 +90,15 @@ def _experience(brain: NavigationBrain, text: str, what: str) -> tuple[int, floa
                 f"0 to {n - 1}"
             )
         return int(text), 0.0
-    match = _PLACE.fullmatch(text)
-    if match is None:
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
         raise RunError(
             f"{what} {text!r}: expected the id of an experience, such as 12, or a position x,y in "
             "metres, such as 1.5,-2"
         )
-    x, y = float(match[1]), float(match[2])
     away = np.hypot(brain.map.poses[:, 0] - x, brain.map.poses[:, 1] - y)
     nearest = int(away.argmin())
     return nearest, float(away[nearest])

@@ -12,7 +12,7 @@ from neuroslam.errors import SourceError, SpaceError, did_you_mean
 from neuroslam.sensors.landmarks import KINDS, Kind, products
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.extents import area_share, distance_to, length_share
-from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.spiking.semantic import CLEAR, SemanticCells
 from neuroslam.spiking.sightings import VIEW
 from neuroslam.spiking.slam import SSPSLAM
 
@@ -24,7 +24,6 @@ EXAMPLES = (
     "the whole map",
 )
 _LEAST_STRENGTH = 0.1  # of a recall, below which a landmark is not known
-_CLEAR = 0.7  # similarity of a recall with the position decoded from it, as a share of its strength
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _COMMA = r"\s*[,\s]\s*"
 _FORMS = (
@@ -242,7 +241,7 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> Contents:
         if cells is not None:
             kind, number = (int(cells.known[c][row]) for c in ("kind", "number"))
             words = cells.words.words_of(kind, number)
-        if strength[row] < _LEAST_STRENGTH or clear[row] < _CLEAR * strength[row]:
+        if strength[row] < _LEAST_STRENGTH or clear[row] < CLEAR * strength[row]:
             missing[name.upper()] = f"{name} is not recalled clearly, strength {strength[row]:.2f}"
             continue
         x, y = at[row]

@@ -1,6 +1,7 @@
 """Path integration by velocity-controlled oscillators, each a population of neurons."""
 
 import math
+from abc import ABC, abstractmethod
 from typing import cast
 
 import torch
@@ -90,7 +91,7 @@ def coupled(
     return inner if pull is None else pull + inner
 
 
-class Packet(BufferModule):
+class Packet(BufferModule, ABC):
     """Base of both path integrators: the position that the phases encode.
 
     State: ``position_m`` ``(batch, dimension)``, ``age`` in steps, and the space's parameters.
@@ -106,9 +107,9 @@ class Packet(BufferModule):
     age: Tensor
 
     @property
+    @abstractmethod
     def z(self) -> Tensor:
         """Fourier coefficients that the oscillators hold, complex, ``(batch, n_frequencies)``."""
-        raise NotImplementedError
 
     def __init__(
         self, space: SSPSpace, config: PathIntegratorConfig, time_step_s: float, batch: int

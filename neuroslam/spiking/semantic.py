@@ -52,8 +52,11 @@ from neuroslam.worlds.landmarks import LandmarkView
 Follows = Literal["nothing", "map", "cells"]
 """What semantic cells are anchored to."""
 
+CLEAR = 0.7
+"""Least similarity of a recall with the position decoded from it, as a share of its strength, at
+which it is the recall of one position."""
+
 _KNOWN = 0.5  # strength of recall above which a landmark is known
-_CLEAR = 0.7  # similarity of recall and decoded position, as a share of the strength
 _STEPS = 3  # Newton steps from the observed to the recalled position
 _CONSENSUS = 3  # known landmarks in sight that can reject an outlier
 _MOVED_M = 0.05  # movement of a landmark with its experience that rewrites the memory
@@ -548,7 +551,7 @@ class SemanticCells(Population):
         recalled = torch.view_as_complex(self.slam.recalled)
         start = self.known["place_m"][row][None].to(recalled.real)
         place = self.decoder.track(recalled, start)
-        clear = _CLEAR * float(recalled.abs().square().mean(-1).sqrt())
+        clear = CLEAR * float(recalled.abs().square().mean(-1).sqrt())
         if float(self.decoder.similarity(recalled, place)) < clear:  # decoded at a side lobe?
             again = torch.from_numpy(seen_m)[None].to(start)
             for _ in range(_STEPS):

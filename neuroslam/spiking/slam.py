@@ -241,7 +241,8 @@ class SSPSLAM(BufferModule):
             velocity_m_s: ``(steps, batch, dimension)``.
             view: What is in view, arrays that lead with ``(steps, batch)``; ``None``: nothing.
             watch: Called after each step with its number and result.
-            every: Number :math:`n`; every n-th step is returned.
+            every: Number :math:`n`; every n-th step is returned, or the last of
+                fewer.
 
         Returns:
             Results, with the steps in front.
@@ -254,7 +255,8 @@ class SSPSLAM(BufferModule):
                 step = self._step(v, *(p[k] for p in sight))
                 if watch is not None:
                     watch(begin + k, step)
-                if (begin + k + 1) % every == 0:
+                last = begin + k + 1 == len(velocity_m_s)
+                if (begin + k + 1) % every == 0 or (last and not results):
                     results.append(step)
         return SSPStep(*(torch.stack(column) for column in zip(*results, strict=True)))
 

@@ -2,8 +2,9 @@
 
 A frame passes through a population in this order: ``observe`` and ``check`` (nothing changes, the
 frame may be refused), ``step`` (self-motion and the population's own senses), ``vetoes`` (before
-the map closes a loop), ``follow`` (what others correct), ``learn`` and ``recall`` (its memory). An
-error after ``check`` leaves the frame half taken: the brain takes no other until a state is loaded.
+the map closes a loop), ``follow`` (corrections by other populations), ``learn`` and ``recall`` (its
+memory). An error after ``check`` leaves the frame half taken: the brain takes no other until a
+state is loaded.
 One population leads: it decides which experience of the map the robot is at.
 """
 

@@ -4,7 +4,7 @@
 every population's state, and a few plain figures. On a machine whose arithmetic rounds as the one
 that wrote them (``arithmetic``), every digest must be equal; on any other, where the last bits of a
 product differ, the figures must. A change of behaviour changes the file, in a commit that says why:
-``python tests/brain/test_golden_traces.py`` writes it anew.
+``python tests/brain/test_golden_traces.py`` rewrites it.
 """
 
 import hashlib

@@ -27,9 +27,9 @@ def brain_of(preset, **over):
 
 def lives(brain, frames):
     """Let a brain take in frames; its positions, the true ones, and whether it was lost."""
-    told = [(*result.pose[:2], *frame.truth[:2], result.lost)
+    track = [(*result.pose[:2], *frame.truth[:2], result.lost)
             for frame in frames for result in [brain(frame)]]  # fmt: skip
-    table = np.array(told)
+    table = np.array(track)
     return table[:, :2], table[:, 2:4], table[:, 4] > 0
 
 
@@ -43,7 +43,7 @@ NINE = "arena:nonagon?minutes=4&noise=1&seed=2"
 
 @pytest.fixture(scope="module")
 def lived():
-    """Lives by motion and walls in an arena, up to a frame: the brain, and what it told."""
+    """Runs by motion and walls in an arena: the brain, its track, the truth, when it was lost."""
 
     @cache
     def live(spec, stop=None, about=""):
@@ -65,8 +65,8 @@ def squares(lived):
 
 def test_a_life_by_walls_and_motion_maps_the_arena():
     brain = brain_of("slrb")
-    told, truth, lost = lives(brain, open_source("arena:pentagon?minutes=2.5&noise=1&seed=3"))
-    assert absolute_trajectory_error(told, truth, "rigid").rmse < 0.04
+    track, truth, lost = lives(brain, open_source("arena:pentagon?minutes=2.5&noise=1&seed=3"))
+    assert absolute_trajectory_error(track, truth, "rigid").rmse < 0.04
     assert not lost.any()
     assert brain.map.n == int(brain.navigation.place.n_cells) > 100
     np.testing.assert_allclose(
@@ -80,10 +80,10 @@ def test_a_scan_does_as_well_as_walls():
     errors = []
     for sensor in ("", "&ranges=180"):
         brain = brain_of("slrb")
-        told, truth, _ = lives(
+        track, truth, _ = lives(
             brain, open_source(f"arena:square?minutes=1.2&noise=1&seed=4{sensor}")
         )
-        errors.append(absolute_trajectory_error(told, truth, "rigid").rmse)
+        errors.append(absolute_trajectory_error(track, truth, "rigid").rmse)
     assert max(errors) < 0.04
 
 
@@ -186,12 +186,12 @@ def kidnapped_drive():
     return [*source.frames(0, 801), *source.frames(1000, 1201)]
 
 
-@pytest.mark.parametrize("carried", ["detect", "ignore"])
-def test_a_kidnapped_animal_with_views_relocalises(carried, kidnapped_drive):
-    brain = brain_of("ratslam_slrb", sessions={"kidnapped": carried})
-    told, truth, _ = lives(brain, renumbered(kidnapped_drive, 0.1))
-    before = align(told[:800], truth[:800])
-    off = np.linalg.norm(before.apply(told) - truth, axis=1)
+@pytest.mark.parametrize("kidnapped", ["detect", "ignore"])
+def test_a_kidnapped_animal_with_views_relocalises(kidnapped, kidnapped_drive):
+    brain = brain_of("ratslam_slrb", sessions={"kidnapped": kidnapped})
+    track, truth, _ = lives(brain, renumbered(kidnapped_drive, 0.1))
+    before = align(track[:800], truth[:800])
+    off = np.linalg.norm(before.apply(track) - truth, axis=1)
     assert np.median(off[:800]) < 0.6
     assert np.median(off[-100:]) < 0.6  # of 12 m
     assert len(brain.stored) == 0
@@ -226,8 +226,8 @@ def test_walls_make_the_map_of_views_better():
     frames = list(open_source("world:ellipse?laps=1.3&noise=0.1&ranges=90"))
     for cells in ("pose", "pose_and_place"):
         brain = brain_of("ratslam_slrb", cells=cells)
-        told, truth, _ = lives(brain, frames)
-        errors[cells] = absolute_trajectory_error(told, truth, "rigid").rmse
+        track, truth, _ = lives(brain, frames)
+        errors[cells] = absolute_trajectory_error(track, truth, "rigid").rmse
     assert errors["pose_and_place"] < 0.7 * errors["pose"]
 
 
@@ -274,14 +274,14 @@ def test_two_sessions_in_one_arena_become_one_map(squares):
 
 
 def test_an_animal_that_continues_after_a_merge_is_localised(squares, lived):
-    _, (told, truth, _) = lived("arena:square?minutes=5.5&noise=1&seed=1", 4800, "square 1")
+    _, (track, truth, _) = lived("arena:square?minutes=5.5&noise=1&seed=1", 4800, "square 1")
     start = truth[0]
-    assert np.linalg.norm(told[-1] + start - truth[-1]) < 0.1
+    assert np.linalg.norm(track[-1] + start - truth[-1]) < 0.1
     merged, reports = join_brains(*squares)
     assert merged is not None, reports[0].reason
     rest = open_source("arena:square?minutes=5.5&noise=1&seed=2").frames(4800)
-    told, truth, lost = lives(merged, rest)
-    off = np.linalg.norm(told + start - truth, axis=1)  # in the first session's frame
+    track, truth, lost = lives(merged, rest)
+    off = np.linalg.norm(track + start - truth, axis=1)  # in the first session's frame
     assert off.mean() < 0.08
     assert not lost.any()
 

@@ -18,8 +18,8 @@ def opened():
     """Open a world that renders each frame once, however many sessions drive through it."""
 
     @cache
-    def open_once(spec, frame_rate_hz=20.0):
-        source = open_source(spec, frame_rate_hz)
+    def open_once(spec, *options):
+        source = open_source(spec, *options)
         if str(spec).startswith("world:"):
             source.frame = cache(source.frame)
         return source

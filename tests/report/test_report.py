@@ -19,9 +19,10 @@ import pytest
 from neuroslam import BrainConfig, load_brain
 from neuroslam.cli import main
 from neuroslam.report import collect, write_report
-from neuroslam.report.collect import chosen_rows, config_rows
+from neuroslam.report.collect import chosen_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
+from neuroslam.report.rows import config_rows
 from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 

@@ -124,6 +124,8 @@ def test_tables_hold_the_bindings_the_goals_and_the_rates_of_a_brain(joined, tmp
     assert column("map.experiences.csv", "pose_1") == brain.map.poses[:, 1].tolist()
     assert sum(column("pose_cells.rates.csv", "rate")) == pytest.approx(1.0, abs=1e-5)
     assert "pixels" not in (tmp_path / "tables" / "view.templates.csv").read_text()
+    inside = call("inspect", joined, "--tables", joined / "tables")
+    assert (inside.code, "cannot be written" in inside.err) == (2, True)
     refused = call("inspect", joined, "--tables", joined)
     assert (refused.code, "is a file; expected a folder" in refused.err) == (2, True)
 

@@ -63,7 +63,9 @@ def test_a_negative_position_is_no_option(folder, tmp_path, call):
 def test_wrong_goals_are_refused_in_one_line(folder, tmp_path, mistake):
     n = load_brain(folder / "brain.safetensors").map.n
     assert f"0 to {n - 1}" in mistake("plan", folder, n, "-o", tmp_path)
-    assert "expected the id of an experience" in mistake("plan", folder, "kitchen", "-o", tmp_path)
+    for goal in ("kitchen", "1.2.3,4", ".,1", "nan,1", "1e999,0", "1,2,3", "-4", ""):
+        said = mistake("plan", folder, goal, "-o", tmp_path)
+        assert "expected the id of an experience" in said, goal
     (tmp_path / "file").write_text("")
     assert "cannot be written" in mistake("plan", folder, 3, "-o", tmp_path / "file")
     save_brain(NavigationBrain(), tmp_path / "empty.safetensors")
@@ -81,7 +83,7 @@ def test_no_path_leads_to_a_part_of_the_map_without_links(folder, tmp_path):
         plan(tmp_path / "brain.safetensors", str(apart))
 
 
-def test_a_map_that_was_moved_and_scaled_is_found_again(folder, tmp_path, call):
+def test_a_map_that_was_moved_and_scaled_is_found_again(folder, tmp_path, call, mistake):
     brain = load_brain(folder / "brain.safetensors")
     poses = brain.map.poses.copy()
     poses[:, :2] = 1.5 * rotate_points(poses[:, :2], 0.5) + [3.0, -2.0]
@@ -92,5 +94,8 @@ def test_a_map_that_was_moved_and_scaled_is_found_again(folder, tmp_path, call):
     assert similar.scale == pytest.approx(1.5, rel=0.01)
     assert similar.turn_deg == pytest.approx(np.degrees(0.5), abs=1.0)
     assert figure.stat().st_size > 10_000
+    assert "give both" in mistake("evaluate", folder, "-o", tmp_path / "again.png")
+    truth = "--truth", folder / "trajectory.tum"
+    assert "give one of them" in mistake("evaluate", folder, "--against", tmp_path, *truth)
     done = call("evaluate", folder, "--against", tmp_path, "-o", tmp_path / "again.png")
     assert (done.code, "similarity" in done.out) == (0, True)

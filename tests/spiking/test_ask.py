@@ -203,15 +203,19 @@ def test_every_example_of_the_grammar_is_in_it():
     ]  # fmt: skip
 
 
+def merged_cells(loaded, partial):
+    states = loaded.state_dict(), partial.state_dict()
+    merged = SemanticCells(SemanticConfig())
+    merged.load_state_dict(
+        merge_landmarks(lambda: SemanticCells(SemanticConfig()), *states, Join.nothing())
+    )
+    return merged
+
+
 def test_a_merge_keeps_the_words_of_both_and_the_later_ones_hold():
     later = LandmarkWords("GATE", "RED", number=0)
     one, other = taught(), taught([later, LandmarkWords("TREE", "GREEN", number=3)])
-    state = merge_landmarks(
-        lambda: SemanticCells(SemanticConfig()), one.state_dict(), other.state_dict(),
-        Join.nothing(),
-    )  # fmt: skip
-    merged = SemanticCells(SemanticConfig())
-    merged.load_state_dict(state)
+    merged = merged_cells(one, other)
     names = [one.name for one in contents(merged).found]
     assert names == ["GATE", "LAMP", "DESK", "TREE", "FENCE", "HALL"]
     assert merged.slam.names == ("GATE", "LAMP", "DESK", "TREE")
@@ -220,12 +224,7 @@ def test_a_merge_keeps_the_words_of_both_and_the_later_ones_hold():
 def test_an_outlier_of_a_later_session_does_not_move_a_landmark_in_a_merge():
     one, other = taught(), SemanticCells(SemanticConfig())
     other.advance(STILL, Sightings.of(np.array([[0.0, 5.0, math.pi]])))
-    state = merge_landmarks(
-        lambda: SemanticCells(SemanticConfig()), one.state_dict(), other.state_dict(),
-        Join.nothing(),
-    )  # fmt: skip
-    merged = SemanticCells(SemanticConfig())
-    merged.load_state_dict(state)
+    merged = merged_cells(one, other)
     np.testing.assert_allclose(ask(merged, "where is door").found[0].position_m, (2, 0), atol=0.05)
 
 

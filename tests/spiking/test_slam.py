@@ -100,6 +100,20 @@ def test_a_map_that_was_saved_goes_on_bit_for_bit(tier, tmp_path):
     assert loaded.names == WORLD.names
 
 
+@pytest.mark.parametrize(("steps", "every", "returned"), [(3, 5, 1), (5, 5, 1), (11, 5, 2)])
+def test_a_run_returns_every_nth_step_or_the_last_of_fewer(steps, every, returned):
+    path = circle(0.01 * steps, 0.01, laps=0.02)
+    runs = []
+    for n in (1, every):
+        slam = slam_in(SSPSLAMConfig(**VECTORS), WORLD)
+        slam.start(torch.from_numpy(path.position_m[:1]))
+        runs.append(slam.run(torch.from_numpy(path.velocity_m_s[:, None]), every=n).position_m)
+    assert len(runs[0]) == len(path.velocity_m_s) == steps
+    assert len(runs[1]) == returned
+    last = (steps // every) * every or steps
+    assert torch.equal(runs[1][-1], runs[0][last - 1])
+
+
 def test_files_that_are_no_maps_are_refused(tmp_path):
     slam = slam_in(SSPSLAMConfig(**VECTORS), WORLD)
     file = tmp_path / "map.safetensors"
