@@ -1,0 +1,109 @@
+"""Compiled steps: plain loops that numba compiles when they are first called.
+
+A compiled step stands in the file of the step that defines it, in torch or numpy, and gives the
+same result up to rounding. It takes numpy arrays that share memory with the buffers, and is used
+where one brain runs on the CPU without gradients. ``NEUROSLAM_COMPILED=0`` in the environment turns
+all of them off. What was compiled is kept beside the file or in the user's cache folder, and
+compiled anew in each process where neither can be written.
+"""
+
+import os
+import types
+from collections.abc import Callable
+from typing import Any, Generic, ParamSpec, TypeVar
+
+from torch import Tensor
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+ENABLED = os.environ.get("NEUROSLAM_COMPILED", "1") != "0"
+"""Whether modules take compiled steps where they can."""
+
+STEPS: dict[str, "Compiled[Any, Any]"] = {}
+"""Every compiled step of the files imported so far, by ``module.name``."""
+
+
+class Compiled(Generic[P, R]):
+    """A function of numbers and numpy arrays that is compiled when it is first called.
+
+    It may call numpy, :mod:`math`, and compiled functions of its own file.
+
+    Attributes:
+        plain: The same function, run by Python: for tests.
+    """
+
+    def __init__(self, plain: Callable[P, R]) -> None:
+        self.plain = plain
+        self.__doc__, self.__name__ = plain.__doc__, plain.__name__
+        self.__module__, self.__wrapped__ = plain.__module__, plain
+        self._dispatcher: Callable[P, R] | None = None
+        STEPS[f"{plain.__module__}.{plain.__name__}"] = self
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the compiled function."""
+        return (self._dispatcher or self.dispatcher())(*args, **kwargs)
+
+    def dispatcher(self) -> Callable[P, R]:
+        """Return numba's function, for callers that call it very often."""
+        if self._dispatcher is None:
+            import numba  # a quarter of a second: only where a step runs
+
+            self._dispatcher = _kept(numba.njit, self._linked())
+        return self._dispatcher
+
+    def _linked(self) -> Callable[P, R]:
+        """Return the function with the compiled functions that it calls in place of wrappers."""
+        plain = self.plain
+        assert isinstance(plain, types.FunctionType)
+        within = dict(plain.__globals__)
+        for name in _names(plain.__code__):
+            other = within.get(name)
+            if isinstance(other, Compiled):
+                within[name] = other.dispatcher()
+        linked = types.FunctionType(
+            plain.__code__, within, plain.__name__, plain.__defaults__, plain.__closure__
+        )
+        linked.__module__, linked.__qualname__ = plain.__module__, plain.__qualname__
+        linked.__kwdefaults__ = plain.__kwdefaults__
+        return linked
+
+
+def _names(code: types.CodeType) -> set[str]:
+    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    return set(code.co_names).union(*map(_names, inner))
+
+
+def _kept(njit: Callable[..., Any], function: Callable[P, R]) -> Callable[P, R]:
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder can be written
+        return njit(**options)(function)
+
+
+def compiled(plain: Callable[P, R]) -> Compiled[P, R]:
+    """Mark a function as a compiled step.
+
+    Example:
+        >>> @compiled
+        ... def total(values):
+        ...     sum_ = 0.0
+        ...     for value in values:
+        ...         sum_ += value
+        ...     return sum_
+        >>> total.plain([1.0, 2.0])
+        3.0
+    """
+    return Compiled(plain)
+
+
+def runs_compiled(*tensors: Tensor) -> bool:
+    """Return whether a compiled step may take these tensors: on the CPU, without gradients.
+
+    Example:
+        >>> import torch
+        >>> runs_compiled(torch.zeros(2, requires_grad=True))
+        False
+    """
+    return ENABLED and not any(t.requires_grad or t.device.type != "cpu" for t in tensors)
