@@ -13,10 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import neuroslam.compiled as switch
+from neuroslam.cells import PoseCellNetwork
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
+from neuroslam.config import PoseCellConfig
+from neuroslam.types import Motion, ViewMatch
 
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if "\n@compiled\n" in path.read_text()]
@@ -34,6 +39,41 @@ def case(*steps):
         return make
 
     return register
+
+
+def with_and_without(do):
+    """Do the same by the definition and by compiled steps; pairs of the arrays that it returns."""
+    found = []
+    for enabled in (False, True):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(switch, "ENABLED", enabled)
+            found.append(do())
+    return list(zip(*found, strict=True))
+
+
+@case("cells.attractor.advance", "cells.attractor.decode_window", "cells.attractor.inject_window")
+def _a_few_frames_of_pose_cells(draw):
+    n_theta, n_xy = draw.integers(7, 14, 2)
+    precision = draw.choice(["float32", "float64"])
+    config = PoseCellConfig(
+        n_theta=n_theta, n_xy=n_xy, cell_size_m=1.0, precision=precision, inject_after=0,
+        excite_size=draw.choice([3, 7]), inhibit_size=draw.choice([3, 5]),
+        decode_radius=draw.integers(1, 8), exact_gain=bool(draw.integers(2)),
+    )  # fmt: skip
+    activity = torch.from_numpy(draw.random((n_theta, n_xy, n_xy)) ** draw.integers(1, 60))
+    start, v, w = draw.random(3), *draw.normal(0.0, 2.0, 2)
+
+    def drive():
+        cells = PoseCellNetwork(config)
+        cells.activity = activity / activity.sum()
+        cells.bindings.append(**dict(zip(("x", "y", "theta"), 7 * start, strict=True)), decay=0.1)
+        frames = [cells.activity, torch.tensor(cells.estimate)]
+        for view in (ViewMatch(0, 0.0, 0.3, False), ViewMatch(-1, -1.0, 0.0, False)):
+            cells(Motion(v, w, 0.4), view)
+            frames += [cells.activity, torch.tensor(cells.estimate, dtype=cells.activity.dtype)]
+        return [frame.numpy() for frame in frames]
+
+    return with_and_without(drive)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
