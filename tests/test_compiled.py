@@ -21,6 +21,7 @@ import neuroslam.compiled as switch
 from neuroslam.cells import PoseCellNetwork
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
 from neuroslam.config import PoseCellConfig
+from neuroslam.mapping.relax import Relaxation
 from neuroslam.types import Motion, ViewMatch
 
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
@@ -74,6 +75,25 @@ def _a_few_frames_of_pose_cells(draw):
         return [frame.numpy() for frame in frames]
 
     return with_and_without(drive)
+
+
+@case("mapping.relax.relax")
+def _loops_of_relaxation(draw):
+    n, n_links = draw.integers(2, 40), draw.integers(1, 90)
+    source = draw.integers(0, n, n_links)
+    links = (
+        source, (source + draw.integers(1, n, n_links)) % n, draw.uniform(0.0, 3.0, n_links),
+        *draw.uniform(-np.pi, np.pi, (2, n_links)),
+    )  # fmt: skip
+    links[4][draw.random(n_links) < 0.2] = np.nan
+    poses, loops = draw.normal(size=(n, 3)), draw.integers(1, 4)
+
+    def relaxed():
+        solved, moved = Relaxation(*links).run(poses, loops, 0.4)
+        turns = np.cos(solved[:, 2]), np.sin(solved[:, 2])  # pi and -pi are one heading
+        return [solved[:, :2].copy(), *turns, np.array(moved)]
+
+    return with_and_without(relaxed)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))

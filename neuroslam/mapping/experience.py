@@ -232,7 +232,7 @@ class ExperienceMap(ExperienceGraph):
         else:
             if self._relaxation is None:
                 links = self.links
-                self._relaxation = Relaxation(*links[:5], n=self.n)
+                self._relaxation = Relaxation(*links[:5])
             solved, s.largest_correction = self._relaxation.run(
                 poses.numpy(), loops, c.correction, c.rest_tolerance
             )
