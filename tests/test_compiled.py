@@ -61,17 +61,19 @@ def _a_few_frames_of_pose_cells(draw):
         excite_size=draw.choice([3, 7]), inhibit_size=draw.choice([3, 5]),
         decode_radius=draw.integers(1, 8), exact_gain=bool(draw.integers(2)),
     )  # fmt: skip
-    activity = torch.from_numpy(draw.random((n_theta, n_xy, n_xy)) ** draw.integers(1, 60))
+    activity = torch.from_numpy(draw.random((n_theta, n_xy, n_xy)) ** draw.integers(9, 60))
+    torus = torch.tensor([n_xy, n_xy, n_theta])
     start, v, w = draw.random(3), *draw.normal(0.0, 2.0, 2)
 
     def drive():
         cells = PoseCellNetwork(config)
         cells.activity = activity / activity.sum()
         cells.bindings.append(**dict(zip(("x", "y", "theta"), 7 * start, strict=True)), decay=0.1)
-        frames = [cells.activity, torch.tensor(cells.estimate)]
+        frames = [cells.activity]
         for view in (ViewMatch(0, 0.0, 0.3, False), ViewMatch(-1, -1.0, 0.0, False)):
             cells(Motion(v, w, 0.4), view)
-            frames += [cells.activity, torch.tensor(cells.estimate, dtype=cells.activity.dtype)]
+            turns = torch.tensor(cells.estimate, dtype=torch.float64) / torus
+            frames += [cells.activity, turns.to(cells.activity)]
         return [frame.numpy() for frame in frames]
 
     return with_and_without(drive)
