@@ -53,9 +53,7 @@ def relax_sequentially(
 
 @compiled
 def relax(
-    x: np.ndarray,
-    y: np.ndarray,
-    theta: np.ndarray,
+    poses: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
     distance_m: np.ndarray,
@@ -70,9 +68,11 @@ def relax(
     Headings do not depend on positions, so that each loop turns all poses first. Arguments of
     :class:`Relaxation` and :meth:`Relaxation.run`.
     """
-    n, n_links, moved = x.size, source.size, 0.0
+    n, n_links, moved = poses.shape[0], source.size, 0.0
     bearing, along_x, along_y = np.empty(n_links), np.empty(n_links), np.empty(n_links)
-    before = np.empty((3, n))
+    x, y, theta, before = np.empty(n), np.empty(n), np.empty(n), np.empty((3, n))
+    for i in range(n):
+        x[i], y[i], theta[i] = poses[i, 0], poses[i, 1], poses[i, 2]
     for loop in range(loops):
         for i in range(n):
             before[0, i], before[1, i], before[2, i] = x[i], y[i], theta[i]
@@ -103,6 +103,9 @@ def relax(
                 moved = max(moved, abs(turned - TWO_PI * np.floor((turned + math.pi) / TWO_PI)))
             if moved <= tolerance:
                 break
+    for i in range(n):
+        poses[i, 0], poses[i, 1] = x[i], y[i]
+        poses[i, 2] = theta[i] - TWO_PI * np.floor((theta[i] + math.pi) / TWO_PI)
     return moved
 
 
@@ -204,6 +207,5 @@ class Relaxation:
                     if moved <= tolerance:
                         break
             return poses, moved
-        x, y, theta = np.array(poses, dtype=np.float64).T.copy()
-        moved = relax(x, y, theta, *self._links, loops, correction, tolerance)
-        return np.column_stack([x, y, wrap_angles(theta)]), moved
+        solved = np.array(poses, dtype=np.float64, order="C")
+        return solved, relax(solved, *self._links, loops, correction, tolerance)
