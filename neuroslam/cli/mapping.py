@@ -156,6 +156,8 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     from neuroslam.runs.inspect import shown_count
 
     figures = summary.to_dict()
+    for note in summary.notes:
+        say(note)
     for note in summary.skipped[:3]:
         complain(command, f"skipped: {note}")
     if len(summary.skipped) > 3:
@@ -200,7 +202,9 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         )
     say(f"Written: {out}")
     if summary.failure:
-        complain(command, f"stopped early: {summary.failure}")
+        skips = summary.bad_frame and command == "run"
+        hint = "; or leave out such frames: --on-bad-frame skip" if skips else ""
+        complain(command, f"stopped early: {summary.failure}{hint}")
         return USER_ERROR
     if summary.interrupted:
         complain(command, f"interrupted; continue with: neuroslam resume {out}")

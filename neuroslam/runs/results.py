@@ -34,6 +34,7 @@ class RunSummary:
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     pictures: bool = False
     interrupted: bool = False
     counts: dict[str, float] = field(default_factory=dict)
@@ -44,6 +45,7 @@ class RunSummary:
     tables: list[str] = field(default_factory=list)
     unplaced: int = 0
     failure: str = ""
+    bad_frame: bool = False
 
     @property
     def cells(self) -> dict[str, float]:
@@ -67,6 +69,7 @@ class RunSummary:
             "skipped_frames": len(self.skipped),
             "skipped": self.skipped,
             "unused": self.unused,
+            "notes": self.notes,
             "pictures": self.pictures,
             "tables": self.tables,
             "interrupted": self.interrupted,

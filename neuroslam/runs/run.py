@@ -174,7 +174,7 @@ def run(
             _drive(
                 brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
             )
-        summary.unused = list(opened.unused)
+        summary.unused, summary.notes = list(opened.unused), list(opened.notes)
         return write_results(brain, plan, out, summary)
 
 
@@ -245,7 +245,7 @@ def resume(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             save = _saver(brain, plan, out, summary, output, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, interrupts, save)
-        summary.unused = list(opened.unused)
+        summary.unused, summary.notes = list(opened.unused), list(opened.notes)
         return write_results(brain, plan, out, summary)
 
 
@@ -305,7 +305,7 @@ def _drive(
     except (SourceError, MapError) as error:
         if brain.half_taken:  # no state to write: what was saved before is kept
             raise RunError(f"{error}; the map is not written: {brain.half_taken}") from error
-        summary.failure = str(error)
+        summary.failure, summary.bad_frame = str(error), isinstance(error, BadFrame)
     summary.interrupted = bool(interrupts)
     # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))

@@ -90,6 +90,11 @@ class WithTruth(Source):
         )
         return (*self.source.unused, note)
 
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of the source."""
+        return self.source.notes
+
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:

@@ -66,6 +66,11 @@ class Streams(Source):
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
             raise self._no_overlap(*spans)
 
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of both sources."""
+        return (*self.motion.notes, *self.camera.notes)
+
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
