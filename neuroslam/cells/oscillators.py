@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from neuroslam.config import GridCellConfig
 from neuroslam.state.mergeable import BufferModule
+from neuroslam.state.pickling import Calls
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
@@ -126,7 +127,7 @@ class VelocityOscillators(BufferModule):
         self.register_buffer("phases", start)
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
         self._waves: tuple[int, Tensor, Tensor] | None = None  # follow from the spacings
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget_waves())
+        self.register_load_state_dict_post_hook(Calls("_forget_waves"))
 
     @property
     def waves(self) -> Tensor:

@@ -24,7 +24,6 @@ from neuroslam.config import (
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.runs.files import OnBadFrame, RowWriter, RunPlan, brain_file, require_free
-from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
@@ -33,6 +32,7 @@ from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.threads import limit_threads
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -160,7 +160,7 @@ def run(
         brain.store(one)
     _announce(on_start, stop, opened)
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -236,7 +236,7 @@ def resume(
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):

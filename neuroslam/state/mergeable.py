@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, Self, TypeVar, overload
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from neuroslam.errors import MapError
 from neuroslam.state.join import Join
+from neuroslam.state.pickling import packed, unpacked
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -49,6 +50,29 @@ class QuickModule(nn.Module):
         if name in self._modules:
             self.__dict__.pop(name, None)
         super().__delattr__(name)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move or convert all tensors, as ``.to`` does; refuse types of too few digits.
+
+        Raises:
+            TypeError: If the type would be of 16 bits or less.
+        """
+        dtype = fn(torch.empty(0)).dtype
+        if dtype.is_floating_point and dtype.itemsize < 4:
+            raise TypeError(
+                f"{type(self).__name__}: {dtype} has too few digits for its activity and "
+                "positions; expected torch.float32 or torch.float64, or a device alone"
+            )
+        return super()._apply(fn, recurse)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle keeps: tensors as arrays, and each part once."""
+        parts = self.__dict__["_modules"]
+        return packed({name: v for name, v in self.__dict__.items() if name not in parts})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over the attributes of another module of the class."""
+        super().__setstate__(unpacked(state))
 
 
 class BufferModule(QuickModule):
