@@ -158,6 +158,8 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     figures = summary.to_dict()
     for note in summary.notes:
         say(note)
+    for warning in summary.warnings:
+        complain(command, f"warning: {warning}")
     for note in summary.skipped[:3]:
         complain(command, f"skipped: {note}")
     if len(summary.skipped) > 3:
@@ -190,10 +192,11 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
             f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
             "if the robot was not kidnapped: --set sessions.kidnapped=ignore"
         )
+    unit = "arbitrary unit" if summary.measured is False else "m"
     if summary.accuracy:
         say(
-            f"ATE (rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
-            f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
+            f"ATE (rigid): map {summary.accuracy['ate_rmse_m']:.3f} {unit}, "
+            f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} {unit}"
         )
     if "ate_similarity_rmse_m" in summary.accuracy:
         say(

@@ -270,6 +270,8 @@ def _steps(
             skip(error)
         else:
             summary.pictures |= frame.image is not None
+            measured = frame.velocity is not None and brain.config.odometry.use != "visual"
+            summary.measured = bool(summary.measured) or measured
             yield frame, result
 
 
