@@ -16,7 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import neuroslam.compiled
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
+from neuroslam.config import OdometryConfig, ViewConfig
+from neuroslam.odometry import VisualOdometry
+from neuroslam.odometry.visual import match_profiles
+from neuroslam.view import LocalViewCells
+from neuroslam.view.preprocess import encode
+from neuroslam.view.search import Geometry, distances
 
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if "\n@compiled\n" in path.read_text()]
@@ -34,6 +41,95 @@ def case(*steps):
         return make
 
     return register
+
+
+def by_both(call):
+    """Return what a call gives by definition, and by compiled steps."""
+    enabled, found = neuroslam.compiled.ENABLED, []
+    try:
+        for neuroslam.compiled.ENABLED in (False, True):
+            found.append(call())
+    finally:
+        neuroslam.compiled.ENABLED = enabled
+    return list(zip(*found, strict=True))
+
+
+def random_images(rng, n=2):
+    """Grey images of one random size: a texture, each noisier than the one before."""
+    height, width = rng.integers(40, 90, 2)
+    texture = rng.integers(0, 256, (height, width), np.uint8)
+    noise = rng.integers(-9, 10, (n, height, width)) * np.arange(n)[:, None, None]
+    return np.clip(texture.astype(int) + noise, 0, 255).astype(np.uint8)
+
+
+def random_view_config(rng):
+    return ViewConfig(
+        template_width=int(rng.integers(12, 32)),
+        template_height=int(rng.integers(3, 12)),
+        shift_match=int(rng.integers(0, 4)),
+        shift_step=int(rng.integers(1, 3)),
+        panoramic=bool(rng.integers(2)),
+        precision=("uint8", "float64")[rng.integers(2)],
+        mean_gate=bool(rng.integers(2)),
+        threshold=float(rng.uniform(0.02, 0.2)),
+        normalisation=(0.0, 0.5)[rng.integers(2)],
+        patch_radius=int(rng.integers(0, 4)),
+    )
+
+
+@case("view.preprocess.encode_step")
+def _encode(rng):
+    (image,), config = random_images(rng, 1), random_view_config(rng)
+    return by_both(lambda: encode(image[:, 1:], config))
+
+
+@case("view.search.nearest_step", "view.search.learn_step")
+def _views(rng):
+    config = random_view_config(rng)
+    size = (int(rng.integers(0, 200)), config.template_height, config.template_width)
+    templates = rng.random(size) * rng.uniform(0.5, 1.0, (size[0], 1, 1))
+    views = rng.random((5, *size[1:]))
+    if size[0]:
+        views[1:] = np.roll(templates[rng.integers(size[0], size=4)], 1, axis=2)
+        templates[-1] = templates[0]
+
+    def call():
+        cells = LocalViewCells(config)
+        for template in templates:
+            cells.learn(template)
+        cells.last.template = 3
+        found = [tuple(cells.search(view)) for view in views]
+        return [found, *(cells.templates[name].numpy() for name in cells.templates.columns)]
+
+    return by_both(call)
+
+
+@case("view.search.distances_step")
+def _distances(rng):
+    geometry = Geometry.of(random_view_config(rng))
+    pixels = rng.integers(0, 256, (7, geometry.width * geometry.height), np.uint8)
+    query = rng.integers(0, 256, (geometry.width, geometry.height), np.uint8)
+    return by_both(lambda: [distances(pixels, query, geometry)])
+
+
+@case("odometry.visual.match_step")
+def _match(rng):
+    n = int(rng.integers(5, 40))
+    now, previous = rng.integers(0, rng.integers(2, 1000), (2, n)).astype(np.int32)
+    return by_both(lambda: match_profiles(now, previous, n // 2))
+
+
+@case("odometry.visual.measure_step")
+def _measure(rng):
+    images, first_frame = random_images(rng, 4), ("still", "zero_profile")[rng.integers(2)]
+    config = OdometryConfig(max_shift_px=9, first_frame=first_frame)
+
+    def call():
+        odometry = VisualOdometry(config)
+        motions = [odometry(image, 0.1) for image in images]
+        return [motions, odometry.speed_sums.numpy(), odometry.turn_sums.numpy()]
+
+    return by_both(call)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
