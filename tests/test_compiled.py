@@ -83,7 +83,7 @@ def _encode(rng):
     return by_both(lambda: encode(image[:, 1:], config))
 
 
-@case("view.search.nearest_step", "view.search.learn_step")
+@case("view.search.nearest_step", "view.search.learn_step", "view.search.coarse_step")
 def _views(rng):
     config = random_view_config(rng)
     size = (int(rng.integers(0, 200)), config.template_height, config.template_width)

@@ -17,6 +17,7 @@ from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
 from neuroslam.view.preprocess import Encoded
 from neuroslam.view.search import (
+    Coarse,
     Geometry,
     Nearest,
     distances,
@@ -89,6 +90,7 @@ class LocalViewCells(Mergeable):
         if config.mean_gate:
             columns["mean"] = ((), torch.float64)
         self.templates = GrowingTable(columns)
+        self._coarse = Coarse()
         self.last = _Last(template=NO_TEMPLATE)
         if config.features != "grey":
             self.network = _Network(digest=0)
@@ -292,7 +294,7 @@ class LocalViewCells(Mergeable):
             columns["blocks"],
             columns["values"],
             self.geometry.core[0],
-            plan.sizes,
+            plan.sizes[3:7],
         )
         if self.config.mean_gate:
             columns["mean"][template] = view.mean() if self._exact else level / 255.0
@@ -341,6 +343,7 @@ class LocalViewCells(Mergeable):
             columns["blocks"],
             columns["values"],
             columns["mean"],
+            self._coarse.of(self.templates.storage()["pixels"], n, geometry),
             n,
             *plan_of(geometry),
             config.threshold + GATE_MARGIN,
