@@ -19,7 +19,7 @@ import neuroslam.compiled
 from benchmarks.timing import Row, cpu_ms
 from neuroslam.config import ViewConfig
 from neuroslam.view import LocalViewCells
-from neuroslam.view.search import _compare, block_means
+from neuroslam.view.search import PRUNE_FROM, _compare, block_means
 
 CONFIG = ViewConfig(template_width=60, template_height=10, shift_match=5)
 REFERENCE = {10_000: "64", 100_000: "~640", 1_000_000: "~6400"}
@@ -167,15 +167,25 @@ def costs(sizes: list[int]) -> dict[str, list[float]]:
 
 
 def draw(sizes: list[int], milliseconds: dict[str, list[float]], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.0, 5.2), layout="constrained")
     styles = ["k:", "k--", "C0s-", "C0o-", "C1s-", "C1o-"]
     for (name, values), style in zip(milliseconds.items(), styles, strict=True):
         axes.loglog(sizes, values, style, markersize=5, label=name)
+    axes.axvline(PRUNE_FROM, color="0.6", linewidth=0.8)
+    axes.annotate(
+        "left of this line a search returns the nearest\n"
+        "of all templates, beyond the threshold too",
+        (PRUNE_FROM, axes.get_ylim()[1]),
+        xytext=(4, -4),
+        textcoords="offset points",
+        va="top",
+        fontsize="small",
+    )
     axes.set_xlabel("templates in the map")
     axes.set_ylabel("CPU time of one search, one thread (ms)")
     axes.set_title("Cost of an exact view search, 60 x 10 px, 11 shifts")
     axes.grid(which="major", alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
     figure.savefig(path, dpi=120)
 
 

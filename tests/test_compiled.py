@@ -21,6 +21,7 @@ from neuroslam.compiled import STEPS, Compiled, _names, compiled
 from neuroslam.config import OdometryConfig, ViewConfig
 from neuroslam.odometry import VisualOdometry
 from neuroslam.odometry.visual import match_profiles
+from neuroslam.sensors.grey import to_grey
 from neuroslam.view import LocalViewCells
 from neuroslam.view.preprocess import encode
 from neuroslam.view.search import Geometry, distances
@@ -77,6 +78,12 @@ def random_view_config(rng):
     )
 
 
+@case("sensors.grey.mean_step")
+def _mean_of_colours(rng):
+    image = rng.integers(0, 256, (*rng.integers(1, 40, 2), 3), np.uint8)
+    return by_both(lambda: [to_grey(image, "mean")])
+
+
 @case("view.preprocess.encode_step")
 def _encode(rng):
     (image,), config = random_images(rng, 1), random_view_config(rng)
@@ -86,7 +93,7 @@ def _encode(rng):
 @case("view.search.nearest_step", "view.search.learn_step", "view.search.coarse_step")
 def _views(rng):
     config = random_view_config(rng)
-    size = (int(rng.integers(0, 200)), config.template_height, config.template_width)
+    size = (int(rng.integers(0, 70)), config.template_height, config.template_width)
     templates = rng.random(size) * rng.uniform(0.5, 1.0, (size[0], 1, 1))
     views = rng.random((5, *size[1:]))
     if size[0]:
