@@ -98,6 +98,8 @@ def _views(rng):
     views = rng.random((5, *size[1:]))
     if size[0]:
         views[1:] = np.roll(templates[rng.integers(size[0], size=4)], 1, axis=2)
+        views[1:] += rng.uniform(-0.02, 0.02, views[1:].shape)  # or two shifts may be equally near
+        views = np.clip(views, 0.0, 1.0)
         templates[-1] = templates[0]
 
     def call():
