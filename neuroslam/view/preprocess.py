@@ -189,7 +189,8 @@ def encode_step(
     view = np.empty(height * width)
     sums = np.empty(width * block_w, np.uint32)
     for row in range(height):
-        sums[:] = 0
+        for x in range(width * block_w):
+            sums[x] = 0
         for y in range(row * block_h, (row + 1) * block_h):
             for x in range(width * block_w):
                 sums[x] += image[y, x]
@@ -201,7 +202,7 @@ def encode_step(
     present = _sum(view) / (height * width)
     squares = np.empty(height * width)
     for i in range(height * width):
-        squares[i] = (view[i] - present) ** 2
+        squares[i] = (view[i] - present) * (view[i] - present)
     contrast = np.sqrt(_sum(squares) / (height * width))
     if mean > 0.0 and present > 0.0:
         for i in range(height * width):
@@ -221,18 +222,19 @@ def _sum(values: np.ndarray) -> float:
     eight, and their sums added.
     """
     eight, total, depth = np.empty(8), 0.0, 0
-    part = np.zeros((64, 3), np.int64)  # parts in each other: start, size, whether half is added
-    part[0, 1] = values.shape[0]
-    half_sum = np.zeros(64)
+    starts, sizes = np.zeros(64, np.int64), np.zeros(64, np.int64)  # of parts in each other
+    halved, half_sums = np.zeros(64, np.int64), np.zeros(64)  # whether a first half is added
+    sizes[0] = values.shape[0]
     while depth >= 0:
-        start, n = part[depth, 0], part[depth, 1]
+        start, n = starts[depth], sizes[depth]
         if n > 128:
             depth += 1
-            part[depth] = start, n // 16 * 8, 0
+            starts[depth], sizes[depth], halved[depth] = start, n // 16 * 8, 0
             continue
         total, whole = 0.0, n // 8 * 8
         if n >= 8:
-            eight[:] = values[start : start + 8]
+            for k in range(8):
+                eight[k] = values[start + k]
             for first in range(start + 8, start + whole, 8):
                 for k in range(8):
                     eight[k] += values[first + k]
@@ -242,14 +244,15 @@ def _sum(values: np.ndarray) -> float:
         for k in range(start + whole, start + n):
             total += values[k]
         depth -= 1
-        while depth >= 0 and part[depth, 2]:
-            total = half_sum[depth] + total
+        while depth >= 0 and halved[depth] == 1:
+            total = half_sums[depth] + total
             depth -= 1
         if depth >= 0:  # the second half of this part
-            half_sum[depth], part[depth, 2] = total, 1
-            half = part[depth, 1] // 16 * 8
-            part[depth + 1] = part[depth, 0] + half, part[depth, 1] - half, 0
+            half_sums[depth], halved[depth] = total, 1
+            half = sizes[depth] // 16 * 8
             depth += 1
+            starts[depth], halved[depth] = starts[depth - 1] + half, 0
+            sizes[depth] = sizes[depth - 1] - half
     return total
 
 

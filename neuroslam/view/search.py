@@ -417,7 +417,8 @@ def nearest_step(
     exact, gated = values.shape[0] > 0, means.shape[0] > 0
     grey, levels = np.empty(2 * half), np.empty(2 * half, np.uint8)
     _to_columns(view, grey, levels)
-    grey[half:], levels[half:] = grey[:half], levels[:half]
+    for at in range(half):
+        grey[half + at], levels[half + at] = grey[at], levels[at]
     mean = 0.0
     for at in range(half):
         mean += grey[at] if exact else np.float64(levels[at])
@@ -584,9 +585,11 @@ def _coarse_bounds(
     sums = np.empty(_TILE, np.uint16)
     for tile in range((n + _TILE - 1) // _TILE):
         part = bounds[tile * _TILE : (tile + 1) * _TILE]
-        part[:] = _LEFT_OUT - 1
+        for k in range(part.shape[0]):
+            part[k] = _LEFT_OUT - 1
         for group in range(n_groups):
-            sums[:] = 0
+            for k in range(_TILE):
+                sums[k] = 0
             for block in range(tiles.shape[1]):
                 _add_outside(tiles[tile, block], low[group, block], high[group, block], sums)
             for k in range(part.shape[0]):
@@ -632,8 +635,10 @@ def _block_ranges(
     """Return the least and largest block means of a view, over groups of shifts and at each."""
     n_shifts = core.shape[0]
     low = np.zeros((n_groups + n_shifts, n_bytes), np.uint8)
-    low[:n_groups, : grid[2] * grid[3]] = 255
-    high = np.zeros_like(low)
+    high = np.zeros((n_groups + n_shifts, n_bytes), np.uint8)
+    for group in range(n_groups):
+        for block in range(grid[2] * grid[3]):
+            low[group, block] = 255
     if n_bytes == 0:
         return low, high
     sums = _block_columns(levels, height, grid)
