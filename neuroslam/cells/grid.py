@@ -1,13 +1,15 @@
 """Grid cells: a lateral anti-Hebbian network (LAHN) that learns hexagons from phases."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuroslam.cells.oscillators import wave_vectors
+from neuroslam.compiled import compiled
 from neuroslam.config import GridCellConfig
-from neuroslam.state.mergeable import BufferModule
+from neuroslam.state.mergeable import Arrays, BufferModule
 
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0
@@ -87,6 +89,35 @@ def lahn_learn(
     fires = (drive > bias).to(bias).mean(0)
     bias = bias + config.threshold_rate * (fires - (1.0 - config.silent_fraction))
     return LAHNWeights(q, w, threshold, bias)
+
+
+@compiled
+def rates_step(
+    phases: np.ndarray, feedforward: np.ndarray, lateral: np.ndarray, bias: np.ndarray,
+    rates: np.ndarray,
+) -> None:  # fmt: skip
+    """Compute the rates of one animal from :func:`lahn_drive`, in place."""
+    n_modules, n_cells, n_inputs = feedforward.shape
+    x = np.empty(n_inputs, np.float32)
+    before = np.empty(n_cells, np.float32)
+    for m in range(n_modules):
+        for k in range(n_inputs):
+            x[k] = phases[m, k // 2, k % 2]
+        before[:] = rates[m]
+        for i in range(n_cells):
+            drive = np.float32(0.0)
+            for k in range(n_inputs):
+                drive += feedforward[m, i, k] * x[k]
+            # Four sums side by side: each alone would wait for its last addition.
+            a = b = c = d = np.float32(0.0)
+            for k in range(0, n_cells - 3, 4):
+                a += lateral[m, i, k] * before[k]
+                b += lateral[m, i, k + 1] * before[k + 1]
+                c += lateral[m, i, k + 2] * before[k + 2]
+                d += lateral[m, i, k + 3] * before[k + 3]
+            for k in range(n_cells - n_cells % 4, n_cells):
+                a += lateral[m, i, k] * before[k]
+            rates[m, i] = max(drive + ((a + b) + (c + d)) - bias[m, i], np.float32(0.0))
 
 
 class LAHNGridCells(BufferModule):
@@ -197,4 +228,12 @@ class LAHNGridCells(BufferModule):
         if self.config.learns_online:
             with torch.no_grad():
                 self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]))
+        return rates
+
+    def rates_compiled(self, phases: np.ndarray) -> np.ndarray:
+        """Do as :meth:`forward` for one animal, in place."""
+        feedforward, lateral, _, bias, rates, _ = cast(Arrays, self.arrays())
+        rates_step(phases, feedforward, lateral, bias, rates)
+        if self.config.learns_online:
+            self.learn(torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)[None])
         return rates
