@@ -20,8 +20,10 @@ from hypothesis import strategies as st
 from neuroslam.cells.boundary import BoundaryCells
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
+from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
+from neuroslam.cells.sheet import SheetParameters, _waves, relax_step, sheet_step, sheet_weights
 from neuroslam.cells.walls import WallMemory
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
 from neuroslam.config import (
@@ -182,6 +184,40 @@ def familiarity(rng):
         theirs.compare_compiled(place, wall_m, bearing, 0.25, (against, supports), 0.5)
         pairs += states(ours, theirs)
     return pairs
+
+
+@case("cells.interference.interference_step")
+@torch.inference_mode()
+def interference(rng):
+    def make():
+        theta_hz = None if seed % 2 else 8.0
+        combine = ("product", "sum")[seed // 2 % 2]
+        return OscillatoryInterference(theta_hz=theta_hz, combine=combine, batch=batch)
+
+    seed, batch, pairs = int(rng.integers(0, 4)), 1, []
+    ours = make()
+    batch = None
+    theirs = make()
+    for _ in range(3):
+        velocity, dt_s = torch.from_numpy(rng.normal(0.0, 0.3, 2)), rng.uniform(0.0, 0.5)
+        pairs.append((ours(velocity[None], dt_s)[0], theirs(velocity, dt_s)))
+        pairs += [(ours.phase_rad[0], theirs.phase_rad), (ours.theta_rad[0], theirs.theta_rad)]
+    return pairs
+
+
+@case("cells.sheet.relax_step")
+@torch.inference_mode()
+def grid_sheet(rng):
+    shape = {"n_y": int(rng.integers(24, 30)), "n_x": int(rng.integers(24, 30))}
+    p = SheetParameters(**shape, surround=rng.uniform(1.01, 2.0))
+    rates = torch.from_numpy(rng.uniform(0.0, 0.2, (4, p.n_y, p.n_x)))
+    drive = torch.from_numpy(rng.normal(0.0, 0.1, 2))
+    stepped = rates.float().numpy()
+    pushed = (1.0 + torch.stack([drive, -drive], dim=-1).flatten()).float().numpy()
+    relax_step(stepped, pushed, 0.2, 3, *_waves(p))
+    for _ in range(3):
+        rates = sheet_step(rates, drive, sheet_weights(p), 0.2)
+    return [(rates.float(), stepped)]
 
 
 ONCE = {make: name for name, make in CASES.items()}
