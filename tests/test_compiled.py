@@ -20,6 +20,17 @@ from hypothesis import strategies as st
 from neuroslam.cells.boundary import BoundaryCells
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
+from neuroslam.cells.head_direction import (
+    HeadDirectionConfig,
+    bump_at,
+    decode_heading,
+    decode_step,
+    inject,
+    inject_step,
+    make_ring,
+    ring_step,
+    turn_step,
+)
 from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
@@ -218,6 +229,25 @@ def grid_sheet(rng):
     for _ in range(3):
         rates = sheet_step(rates, drive, sheet_weights(p), 0.2)
     return [(rates.float(), stepped)]
+
+
+@case("cells.head_direction.turn_step", "cells.head_direction.inject_step",
+      "cells.head_direction.decode_step")  # fmt: skip
+@torch.inference_mode()
+def head_direction(rng):
+    config = HeadDirectionConfig(n=int(rng.integers(24, 130)), exponent=rng.choice([2.0, 1.5]))
+    ring, at = make_ring(config), rng.uniform(-4, 4)
+    order, _, kernels, bump, windows = (part.numpy() for part in ring[:5])
+    ours, theirs, pairs = bump_at(ring, at), bump_at(ring, at).numpy(), []
+    for _ in range(3):
+        turn, cue, share = rng.normal(0.0, 0.5), rng.uniform(-4, 4), rng.random()
+        ours = ring_step(ours, turn, share, ring)
+        theirs = turn_step(theirs, turn, share, order, kernels, config.gain, config.exponent)
+        pairs += [(ours, theirs), (decode_heading(ours, ring), decode_step(theirs, windows))]
+        ours = inject(ours, cue, share / 2, ring)
+        theirs = inject_step(theirs, cue, share / 2, order, bump)
+        pairs.append((ours, theirs))
+    return pairs
 
 
 ONCE = {make: name for name, make in CASES.items()}
