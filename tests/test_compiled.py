@@ -136,7 +136,8 @@ def grid_cells(rng):
 @case("cells.place.compete_step")
 @torch.inference_mode()
 def place_cells(rng):
-    ours, theirs = twins(lambda: CompetitiveHebbianPlaceCells(PlaceCellConfig(), n_grid=26))
+    config = PlaceCellConfig(excitation=float(rng.choice([0.0, 0.7])), excitation_m=0.08)
+    ours, theirs = twins(lambda: CompetitiveHebbianPlaceCells(config, n_grid=26))
     at, waves, pairs = np.zeros(2), rng.normal(0.0, 3.0, (26, 2)), []
     for _ in range(90 if rng.random() < 0.2 else 25):  # 90: more cells than the first table has
         at = at + rng.normal(0.0, 0.12, 2)

@@ -65,6 +65,54 @@ def place_response(
     return similarity.pow(power) * (away_m2 * (-0.5 / continuity_m**2)).exp()
 
 
+def excited(response: Tensor, centres_m: Tensor, gain: float, width_m: float) -> Tensor:
+    r"""Let place cells excite each other by a kernel over the distance of their centres.
+
+    .. math:: e_j = p_j + g \sum_k e^{-|X_j - X_k|^2 / 2 s^2} \, p_k
+
+    Cells lie anywhere, so that the convolution is a product with the kernel of their distances.
+
+    Args:
+        response: :math:`p`, ``(..., n)``.
+        centres_m: :math:`X`, ``(..., n, 2)``.
+        gain: :math:`g`.
+        width_m: :math:`s`.
+
+    Returns:
+        ``(..., n)``; for a narrow kernel :math:`(1 + g)\,p`.
+
+    Example:
+        >>> line = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]])
+        >>> excited(torch.tensor([0.0, 1.0, 0.0]), line, 0.5, 0.1).tolist()[1]
+        1.5
+    """
+    squares = (centres_m.unsqueeze(-2) - centres_m.unsqueeze(-3)).square().sum(-1)
+    kernel = (squares * (-0.5 / width_m**2)).exp().to(response)
+    return response + gain * (kernel @ response.unsqueeze(-1)).squeeze(-1)
+
+
+def bump_of(excitation: Tensor, inhibition: float) -> Tensor:
+    r"""Return the bump of place cells that global inhibition leaves, sum 1.
+
+    .. math:: b_j = \frac{[e_j - \varphi \max_k e_k]_+}{\sum_k [e_k - \varphi \max_l e_l]_+}
+
+    The winner is the limit of :math:`\varphi \to 1`.
+
+    Args:
+        excitation: :math:`e`, of :func:`excited`, ``(..., n)``.
+        inhibition: :math:`\varphi`, in [0, 1).
+
+    Returns:
+        ``(..., n)``; zeros where no cell is active.
+
+    Example:
+        >>> bump_of(torch.tensor([0.25, 1.0, 0.75]), 0.5).mul(3).tolist()
+        [0.0, 2.0, 1.0]
+    """
+    left = (excitation - inhibition * excitation.amax(-1, keepdim=True)).clamp_min(0.0)
+    return left / left.sum(-1, keepdim=True).clamp_min(torch.finfo(left.dtype).tiny)
+
+
 def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
     r"""Move the winner's weights towards the grid pattern.
 
@@ -111,9 +159,28 @@ def _link(start: int, end: int, neighbours: np.ndarray) -> None:
 
 
 @compiled
+def _excited(
+    responses: np.ndarray, window: np.ndarray, centres_m: np.ndarray, gain: float, width_m: float
+) -> np.ndarray:
+    """Do as :func:`excited` for the cells of the window."""
+    out = np.empty_like(responses)
+    for j in range(responses.size):
+        total = np.float32(0.0)
+        for k in range(responses.size):
+            if responses[k] > 0.0:
+                dx = centres_m[0, window[0, j], 0] - centres_m[0, window[0, k], 0]
+                dy = centres_m[0, window[0, j], 1] - centres_m[0, window[0, k], 1]
+                kernel = np.float32(math.exp((dx * dx + dy * dy) * (-0.5 / width_m**2)))
+                total += kernel * responses[k]
+        out[j] = responses[j] + np.float32(gain) * total
+    return out
+
+
+@compiled
 def compete_step(
     resumes: bool, rates: np.ndarray, position_m: np.ndarray, dt_s: float, stay_s: float,
     learns: int, power: float, continuity_m: float, threshold_m: float, rate: float,
+    excitation: float, excitation_m: float,
     n_cells: np.ndarray, weights: np.ndarray, centres_m: np.ndarray, visits: np.ndarray,
     time_s: np.ndarray, neighbours: np.ndarray, winner: np.ndarray, window: np.ndarray,
     landmarks_m: np.ndarray, leash_m2: np.ndarray,
@@ -149,7 +216,8 @@ def compete_step(
     norm = max(np.float32(math.sqrt(squares)), np.float32(1e-12))
     for k in range(n_grid):
         grid[k] /= norm
-    slot, best, nearest, far, farthest = 0, np.float32(-1.0), np.inf, 0, -1.0
+    nearest, far, farthest = np.inf, 0, -1.0
+    responses = np.empty(window.shape[1], np.float32)
     for k in range(window.shape[1]):
         cell = window[0, k]
         dx, dy = centres_m[0, cell, 0] - x, centres_m[0, cell, 1] - y
@@ -167,9 +235,10 @@ def compete_step(
             a += weights[0, cell, i] * grid[i]
         similarity = max((a + b) + (c + d), zero)
         near = math.exp(np.float32(away) * np.float32(-0.5 / continuity_m**2))
-        response = np.float32(similarity ** np.float32(power)) * near
-        if response > best:
-            slot, best = k, response
+        responses[k] = np.float32(similarity ** np.float32(power)) * near
+    if excitation > 0.0:
+        responses = _excited(responses, window, centres_m, excitation, excitation_m)
+    slot = np.argmax(responses)
     recruits = nearest >= threshold_m**2 and learns != 0
     if recruits:
         new = n_cells[0]
@@ -222,7 +291,8 @@ class Stay(Scalars):
 class CompetitiveHebbianPlaceCells(BufferModule):
     """Place cells that compete for patterns of grid cells; a new one is recruited far from others.
 
-    :func:`place_response` and :func:`hebbian_step` have the mathematics. The winner is found among
+    :func:`place_response`, :func:`excited`, :func:`bump_of` and :func:`hebbian_step` have the
+    mathematics. The winner is found among
     the nearest cells: beyond them the response is bounded by the distance alone. State: for every
     cell its ``weights``, ``centres_m``, ``visits``, ``time_s`` and ``neighbours`` (the graph:
     cells that won one after the other), and the window of nearest cells.
@@ -318,6 +388,8 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         c = self.config
         away = (centres - position.unsqueeze(1)).square().sum(-1)
         response = place_response(weights, away.to(grid), grid, c.power, c.continuity_m)
+        if c.excitation:
+            response = excited(response, centres, c.excitation, c.excitation_m)
         slot = response.argmax(-1)
         recruited = away.amin(-1) >= c.threshold_m**2
         if learns is not None:
@@ -359,7 +431,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
             *arrays, _ = cast(Arrays, self.arrays())
             done = compete_step(
                 grows, rates, position_m, dt_s, now.stay_s, told, c.power, c.continuity_m,
-                c.threshold_m, c.hebbian_rate, *arrays,
+                c.threshold_m, c.hebbian_rate, c.excitation, c.excitation_m, *arrays,
             )  # fmt: skip
             grows = done >= 4
             if not grows:
@@ -394,6 +466,23 @@ class CompetitiveHebbianPlaceCells(BufferModule):
             away = (self.centres_m[:, :n] - position.unsqueeze(1)).square().sum(-1).to(away)
         response = place_response(weights, away, grid, c.power, c.continuity_m)
         return response[0] if one else response
+
+    @without_gradients
+    def bump(self, grid: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the bump of all cells ``([batch,] n)``, and the position that it encodes.
+
+        Args:
+            grid: Rates of the grid cells, ``([batch,] n_grid)``.
+            position_m: Where the animal believes to be, ``([batch,] 2)``.
+
+        Returns:
+            The bump, of :func:`bump_of`, and its centre of mass, ``([batch,] 2)``, metres.
+        """
+        c, response = self.config, self.responses(grid, position_m)
+        centres = self.centres_m[:, : response.shape[-1]]
+        centres = centres[0] if self.batch is None else centres
+        bump = bump_of(excited(response, centres, c.excitation, c.excitation_m), c.inhibition)
+        return bump, (bump.to(centres).unsqueeze(-1) * centres).sum(-2)
 
     def centre_of(self, cells: Tensor) -> Tensor:
         """Return the centre of one cell of each animal, ``([batch,] 2)``."""

@@ -232,6 +232,26 @@ class PlaceCellConfig(Section):
         description="share by which the winner's weights move to the grid pattern in a step; "
         "larger: faster, forgets sooner; 0: no learning",
     )
+    excitation: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="how strongly a place cell excites its neighbours before cells compete; "
+        "larger: a wider bump; 0: the cell with the largest response wins",
+    )
+    excitation_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="width of the Gaussian over the distance of place cells by which they excite "
+        "each other; larger: reaches farther cells",
+    )
+    inhibition: float = Field(
+        default=0.3,
+        ge=0,
+        lt=1,
+        description="share of the largest activity that global inhibition takes from all place "
+        "cells; larger: fewer cells in the bump",
+    )
 
 
 class WallMemoryConfig(Section):
