@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells.boundary import BoundaryCells
+from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.head_direction import (
@@ -100,6 +101,18 @@ def boundary_cells(rng):
         _, bearing = theirs.respond_compiled(0.1, heading, wall_m, relative, dt_s)
         pairs += [*states(ours, theirs), (relative + heading, bearing)]
     return pairs
+
+
+@case("cells.boundary_sheet.respond_step", "cells.boundary_sheet.read_step")
+@torch.inference_mode()
+def boundary_sheet(rng):
+    sheet = BoundarySheet(BoundaryCellConfig(sheet_bearings=int(rng.integers(36, 80))))
+    wall_m, bearing = tensors(*walls_around(rng))
+    batch, rates = sheet(wall_m[None], bearing[None]), sheet(wall_m, bearing)
+    return [
+        (batch[0], rates),
+        *((p[0], q) for p, q in zip(sheet.read(batch), sheet.read(rates), strict=True)),
+    ]
 
 
 @case("cells.oscillators.shift_step", "cells.oscillators.decode_step")
