@@ -103,8 +103,10 @@ def respond_step(
         if not np.isfinite(distance_m[w]):
             continue
         xi = beta_m * math.log1p(distance_m[w] / beta_m)
-        spread_a[:] = 0.0
-        spread_d[:] = 0.0
+        for i in range(n):
+            spread_a[0, i] = spread_a[1, i] = 0.0
+        for i in range(m):
+            spread_d[0, i] = spread_d[1, i] = 0.0
         for k in range(n):
             apart = (bearing_rad[w] - bearings_rad[k] + math.pi) % TWO_PI - math.pi
             a[k] = math.exp(-0.5 * (apart / widths[0]) ** 2)
@@ -181,7 +183,8 @@ def read_step(
             narrow = 1.0 / (1.0 / min(spread, 0.99 * square) - 1.0 / square)
             at = count
             while at > 0 and found[at - 1, 0] > distance:
-                found[at] = found[at - 1]
+                for i in range(3):
+                    found[at, i] = found[at - 1, i]
                 at -= 1
             found[at, 0], found[at, 1] = distance, angle
             found[at, 2] = math.sqrt(narrow) * step_m * (distance / beta_m + 1.0)
