@@ -36,6 +36,7 @@ from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.sheet import SheetParameters, _waves, relax_step, sheet_step, sheet_weights
+from neuroslam.cells.speed import SpeedCells
 from neuroslam.cells.walls import WallMemory
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
 from neuroslam.config import (
@@ -44,6 +45,7 @@ from neuroslam.config import (
     PlaceCellConfig,
     WallMemoryConfig,
 )
+from neuroslam.types import Motion
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
 
@@ -285,6 +287,20 @@ def walks(rng):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neuroslam.compiled.ENABLED", False)
         return [(roam(arena, 0.3, np.random.default_rng(seed)).positions, got)]
+
+
+@case("cells.speed.rates_step")
+@torch.inference_mode()
+def speed_cells(rng):
+    ours, theirs = SpeedCells(batch=1), SpeedCells()
+    pairs = []
+    for dt_s in (0.0, *rng.uniform(0.0, 0.2, 4)):
+        speed = rng.uniform(-1.0, 3.0)
+        ours.advance(Motion(*tensors([speed], [0.0]), dt_s))
+        theirs.advance(Motion(speed, 0.0, dt_s))
+        pairs += [(ours.rates_hz[0], theirs.rates_hz.clone())]
+        pairs += [(ours.smoothed_m_s[0], theirs.smoothed_m_s.clone())]
+    return pairs
 
 
 ONCE = {make: name for name, make in CASES.items()}
