@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells.boundary import BoundaryCells
+from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.head_direction import (
@@ -35,6 +36,7 @@ from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.sheet import SheetParameters, _waves, relax_step, sheet_step, sheet_weights
+from neuroslam.cells.speed import SpeedCells
 from neuroslam.cells.walls import WallMemory
 from neuroslam.compiled import STEPS, Compiled, _names, compiled
 from neuroslam.config import (
@@ -43,6 +45,7 @@ from neuroslam.config import (
     PlaceCellConfig,
     WallMemoryConfig,
 )
+from neuroslam.types import Motion
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
 
@@ -100,6 +103,18 @@ def boundary_cells(rng):
         _, bearing = theirs.respond_compiled(0.1, heading, wall_m, relative, dt_s)
         pairs += [*states(ours, theirs), (relative + heading, bearing)]
     return pairs
+
+
+@case("cells.boundary_sheet.respond_step", "cells.boundary_sheet.read_step")
+@torch.inference_mode()
+def boundary_sheet(rng):
+    sheet = BoundarySheet(BoundaryCellConfig(sheet_bearings=int(rng.integers(36, 80))))
+    wall_m, bearing = tensors(*walls_around(rng))
+    batch, rates = sheet(wall_m[None], bearing[None]), sheet(wall_m, bearing)
+    return [
+        (batch[0], rates),
+        *((p[0], q) for p, q in zip(sheet.read(batch), sheet.read(rates), strict=True)),
+    ]
 
 
 @case("cells.oscillators.shift_step", "cells.oscillators.decode_step")
@@ -273,6 +288,20 @@ def walks(rng):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neuroslam.compiled.ENABLED", False)
         return [(roam(arena, 0.3, np.random.default_rng(seed)).positions, got)]
+
+
+@case("cells.speed.rates_step")
+@torch.inference_mode()
+def speed_cells(rng):
+    ours, theirs = SpeedCells(batch=1), SpeedCells()
+    pairs = []
+    for dt_s in (0.0, *rng.uniform(0.0, 0.2, 4)):
+        speed = rng.uniform(-1.0, 3.0)
+        ours.advance(Motion(*tensors([speed], [0.0]), dt_s))
+        theirs.advance(Motion(speed, 0.0, dt_s))
+        pairs += [(ours.rates_hz[0], theirs.rates_hz.clone())]
+        pairs += [(ours.smoothed_m_s[0], theirs.smoothed_m_s.clone())]
+    return pairs
 
 
 ONCE = {make: name for name, make in CASES.items()}

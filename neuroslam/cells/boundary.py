@@ -130,7 +130,9 @@ def respond_step(
     activity[()] = grown
     gate = activity[()]
     half, turn, two_pi = np.float32(math.sqrt(0.5)), np.float32(math.pi), np.float32(TWO_PI)
-    rates[:] = 0.0
+    for k in range(preferred_rad.shape[0]):
+        for d in range(preferred_m.shape[0]):
+            rates[k, d] = 0.0
     if gate == 0.0:
         return nearest
     by_distance = np.empty(preferred_m.shape[0], np.float32)

@@ -65,7 +65,7 @@ def compare_step(
     n, cell = slack.shape[0], max(winner, 0)
     felt = np.zeros((2, n), np.float32)
     for w in range(distance_m.shape[0]):
-        k = int(np.round((bearing_rad[w] - error_rad) * (n / TWO_PI))) % n
+        k = round((bearing_rad[w] - error_rad) * (n / TWO_PI)) % n
         away = np.float32(distance_m[w])
         if away < np.float32(reach_m):
             felt[0, k] = 1.0

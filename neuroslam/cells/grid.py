@@ -103,7 +103,8 @@ def rates_step(
     for m in range(n_modules):
         for k in range(n_inputs):
             x[k] = phases[m, k // 2, k % 2]
-        before[:] = rates[m]
+        for i in range(n_cells):
+            before[i] = rates[m, i]
         for i in range(n_cells):
             drive = np.float32(0.0)
             for k in range(n_inputs):

@@ -285,7 +285,10 @@ def turn_step(
         even, odd = math.cos(order[k] * turn_rad), math.sin(order[k] * turn_rad)
         for i in range(2 * n):
             both[i] += even * kernels[k, i] + odd * kernels[half + k, i]
-    move, drive = np.concatenate((both[:n], both[:n])), np.concatenate((both[n:], both[n:]))
+    move, drive = np.empty(2 * n), np.empty(2 * n)  # twice around
+    for i in range(n):
+        move[i] = move[n + i] = both[i]
+        drive[i] = drive[n + i] = both[n + i]
     moved, settled = np.zeros(n), np.zeros(n)
     for j in range(n):
         rate = activity[j]
@@ -328,7 +331,10 @@ def inject_step(
 @compiled
 def decode_step(activity: np.ndarray, windows: np.ndarray) -> float:
     """Do as :func:`decode_heading` for one ring."""
-    peak, x, y = np.argmax(activity), 0.0, 0.0
+    peak, x, y = 0, 0.0, 0.0
+    for i in range(activity.shape[0]):
+        if activity[i] > activity[peak]:
+            peak = i
     for i in range(activity.shape[0]):
         weight = activity[i] * activity[i]
         x += windows[peak, 0, i] * weight

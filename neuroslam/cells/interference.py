@@ -89,7 +89,10 @@ def interference_step(
     Several phases of theta, ``(n,)``, give the mean rate over them.
     """
     n_modules, n_cells, n_waves = offset_rad.shape
-    crests, troughs = np.cos(theta_rad), np.sin(theta_rad)
+    n_thetas = theta_rad.shape[0]
+    crests, troughs = np.empty(n_thetas), np.empty(n_thetas)
+    for k in range(n_thetas):
+        crests[k], troughs[k] = math.cos(theta_rad[k]), math.sin(theta_rad[k])
     for m in range(n_modules):
         for j in range(n_waves):
             along = velocity_m_s[0] * waves_rad_m[m, j, 0] + velocity_m_s[1] * waves_rad_m[m, j, 1]
@@ -101,14 +104,14 @@ def interference_step(
                 phase = phase_rad[m, j] - offset_rad[m, i, j]
                 c[j], s[j] = 1.0 + math.cos(phase), math.sin(phase)
             total = 0.0
-            for k in range(theta_rad.shape[0]):
+            for k in range(n_thetas):
                 met, mean = 1.0, 0.0
                 for j in range(n_waves):
                     crest = 0.5 * (crests[k] * c[j] - troughs[k] * s[j])
                     met, mean = met * crest, mean + crest
                 met = met if product else mean / n_waves
                 total += max(met - threshold, 0.0)
-            rates[m * n_cells + i] = total / (1.0 - threshold) / theta_rad.shape[0]
+            rates[m * n_cells + i] = total / (1.0 - threshold) / n_thetas
 
 
 def lattice_waves(orientation_rad: Tensor, directions: int) -> Tensor:

@@ -280,10 +280,11 @@ class NavigationCells(Population):
 
     def step(self, now: StepInput, observation: np.ndarray | None) -> Correction:
         """Advance by a frame of the brain; return the walls' correction of position and heading."""
-        error = self.heading_error_rad
+        before = self.heading_error_rad
         self._estimate = self._advance(now.motion, now.compass_rad, observation)
         dx, dy = self._estimate.correction_m.tolist()
-        return Correction(dx, dy, error - self.heading_error_rad, self.pose.theta_rad)
+        error = self.heading_error_rad
+        return Correction(dx, dy, before - error, wrap_angle(self.now.heading_rad - error))
 
     def advance(
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None

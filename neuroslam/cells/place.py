@@ -143,7 +143,10 @@ def _look_up(x_m: float, y_m: float, n: int, centres_m: np.ndarray, window: np.n
             continue
         away[at], window[0, at] = square, k
         if k >= size - 1:
-            worst = np.argmax(away)
+            worst = 0
+            for j in range(size):
+                if away[j] > away[worst]:
+                    worst = j
 
 
 @compiled
@@ -209,10 +212,12 @@ def compete_step(
         landmarks_m[0, 0, 0], landmarks_m[0, 0, 1] = x, y
     n_grid, zero = weights.shape[2], np.float32(0.0)
     grid = np.empty(n_grid, np.float32)
-    squares, flat = zero, rates.reshape(-1)
-    for k in range(n_grid):
-        grid[k] = flat[k]
-        squares += flat[k] * flat[k]
+    squares, k = zero, 0
+    for m in range(rates.shape[0]):
+        for i in range(rates.shape[1]):
+            grid[k] = rates[m, i]
+            squares += grid[k] * grid[k]
+            k += 1
     norm = max(np.float32(math.sqrt(squares)), np.float32(1e-12))
     for k in range(n_grid):
         grid[k] /= norm
@@ -244,7 +249,8 @@ def compete_step(
         new = n_cells[0]
         if new >= weights.shape[1]:
             return 4
-        weights[0, new] = grid
+        for i in range(n_grid):
+            weights[0, new, i] = grid[i]
         centres_m[0, new, 0], centres_m[0, new, 1] = x, y
         n_cells[0] = new + 1
         # The new cell replaces the farthest in the window, unless it is there already.

@@ -83,8 +83,7 @@ def predict_step(
             p[i, 3] *= stays
         errors[0, 1] *= stays
     p[3, 3] += numbers[_SLOW_RAD2] * (1.0 - stays * stays)
-    moved_m[:] = 0.0
-    squares_m2[:] = 0.0
+    moved_m[0, 0] = moved_m[0, 1] = squares_m2[0] = 0.0
 
 
 @compiled
@@ -137,9 +136,9 @@ def _recalled(
         return -1, _NEEDS_SLOT
     if new:
         wall = n
-        row = (x_m, y_m, bearing_rad, distance_m, _UNKNOWN_M2, time_s)
-        for column in range(6):
-            walls[0, wall, column] = row[column]
+        walls[0, wall, 0], walls[0, wall, 1] = x_m, y_m
+        walls[0, wall, 2], walls[0, wall, 3] = bearing_rad, distance_m
+        walls[0, wall, 4], walls[0, wall, 5] = _UNKNOWN_M2, time_s
         n_walls[0] = n + 1
     if free < 0:
         farthest = -1.0
@@ -149,8 +148,8 @@ def _recalled(
                 free, farthest = slot, dx * dx + dy * dy
         for slot in range(width):
             walls[0, active[0, slot], 4] = covariance[0, OWN + slot, OWN + slot]
-    covariance[0, OWN + free, :] = 0.0
-    covariance[0, :, OWN + free] = 0.0
+    for j in range(covariance.shape[1]):
+        covariance[0, OWN + free, j] = covariance[0, j, OWN + free] = 0.0
     covariance[0, OWN + free, OWN + free] = walls[0, wall, 4]
     active[0, free] = wall
     return free, _DONE
