@@ -42,7 +42,7 @@ class QuickModule(nn.Module):
         """Set an attribute as torch does; a part that is set to ``None`` is not found any more."""
         if value is None and name in self.__dict__.get("_modules", ()):
             self.__dict__.pop(name, None)
-        super().__setattr__(name, value)
+        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]
 
     def __delattr__(self, name: str) -> None:
         """Delete an attribute, and what was found by its name."""
