@@ -110,6 +110,14 @@ def test_every_place_of_a_row_is_there(source, row):
         papers.check_place(place)
 
 
+@pytest.mark.parametrize(("source", "row"), rows("where"))
+def test_a_number_in_a_remark_is_on_a_page_that_the_row_links_to(source, row):
+    pages = [place.partition("#")[0] for place in row["where"] if ".md" in place]
+    text = " ".join((papers.ROOT / page).read_text("utf-8") for page in pages)
+    numbers = re.findall(r"\d*\.\d+|\d{2,}", row.get("why", "") if pages else "")
+    assert [n for n in numbers if not re.search(rf"(?<![\d.]){re.escape(n)}(?!\d)", text)] == []
+
+
 @pytest.mark.parametrize(("source", "row"), rows("key"))
 def test_a_parameter_has_a_key_and_is_as_printed_only_if_it_is(source, row):
     assert row in papers.TABLE[source]["parameters"]
