@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuroslam.experiments import place_cells as experiment
 from neuroslam.experiments import place_bump, place_methods
+from neuroslam.experiments import place_cells as experiment
 from neuroslam.experiments.animals import read_track, run_cells, simulate
 from neuroslam.figures.place_errors import Spread
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
