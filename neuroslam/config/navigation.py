@@ -123,6 +123,31 @@ class GridCellConfig(Section):
         description="learning rate of the inhibition between cells; larger: cells become different "
         "sooner",
     )
+    lateral: Literal["learned", "kernel", "both"] = Field(
+        default="learned",
+        description="coupling of the cells of a module: learned inhibition; a kernel over the "
+        "sheet on which they lie, that excites neighbours; or both added up",
+    )
+    excitation: float = Field(
+        default=2.0,
+        ge=0,
+        description="strength of the kernel's excitation; larger: neighbours fire more alike",
+    )
+    excitation_cells: float = Field(
+        default=1.0,
+        gt=0,
+        description="width of the kernel's excitation in cells; larger: reaches farther",
+    )
+    inhibition: float = Field(
+        default=2.0,
+        ge=0,
+        description="strength of the kernel's inhibition; larger: cells far apart fire less alike",
+    )
+    inhibition_cells: float = Field(
+        default=2.0,
+        gt=0,
+        description="width of the kernel's inhibition in cells; larger: reaches farther",
+    )
     threshold_rate: float = Field(
         default=0.02,
         ge=0,

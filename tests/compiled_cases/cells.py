@@ -106,7 +106,10 @@ def oscillators(rng):
 @torch.inference_mode()
 def grid_cells(rng):
     n_cells = int(rng.integers(1, 26))
-    config = GridCellConfig(n_cells=n_cells, development_steps=5, learns_online=rng.random() < 0.3)
+    config = GridCellConfig(
+        n_cells=n_cells, development_steps=5, learns_online=rng.random() < 0.3,
+        lateral=rng.choice(["learned", "kernel", "both"]),
+    )  # fmt: skip
     ours, theirs = twins(lambda: LAHNGridCells(config))
     pairs = []
     for _ in range(3):
