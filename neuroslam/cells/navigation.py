@@ -147,10 +147,10 @@ class NavigationCells(Population):
             check_walls(wall_m, wall_bearing_rad)
         _check_duration(dt_s)
         if self._compiles() and runs_compiled(wall_m):
-            walls = (
-                np.ascontiguousarray(w.numpy(), np.float64) for w in (wall_m, wall_bearing_rad)
-            )
-            return self._step(float(speed_m_s), float(heading_rad), dt_s, *walls, compass, read)
+            felt_m = np.ascontiguousarray(wall_m.numpy(), np.float64)
+            felt_rad = np.ascontiguousarray(wall_bearing_rad.numpy(), np.float64)
+            speed, heading = float(speed_m_s), float(heading_rad)
+            return self._step(speed, heading, dt_s, felt_m, felt_rad, compass, read)
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -202,7 +202,6 @@ class NavigationCells(Population):
         """Return whether the steps of this process and of these cells are compiled."""
         return self.batch is None and runs_compiled(self._parts[1].errors)
 
-    @without_gradients
     def _step(
         self,
         speed_m_s: float,
@@ -314,7 +313,8 @@ class NavigationCells(Population):
         wall_m, bearing = felt.T.copy()
         if self._compiles():
             _check_duration(motion.dt_s)
-            here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
+            with torch.inference_mode():
+                here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
         else:
             columns = ([motion.v_m_s, heading], wall_m, bearing)
             device = self._parts[1].errors.device
