@@ -106,9 +106,6 @@ class NavigationCells(Population):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
-        self._parts = (
-            self.boundary, self.walls, self.oscillators, self.grid, self.place, self.familiarity,
-        )  # fmt: skip
         self._senses = cells_sense
         self.now = NavigationState(config.map.initial_heading_deg)
         # Pose at which each view was learnt; ``sure`` is 0 if the animal was lost.
@@ -200,7 +197,7 @@ class NavigationCells(Population):
 
     def _compiles(self) -> bool:
         """Return whether the steps of this process and of these cells are compiled."""
-        return self.batch is None and runs_compiled(self._parts[1].errors)
+        return self.batch is None and runs_compiled(self.walls.errors)
 
     def _step(
         self,
@@ -213,7 +210,8 @@ class NavigationCells(Population):
         read: bool = False,
     ) -> NavigationEstimate:
         """Do as :meth:`forward` for one animal by compiled steps."""
-        boundary, memory, oscillators, grid, place, familiarity = self._parts
+        boundary, memory, oscillators = self.boundary, self.walls, self.oscillators
+        grid, place, familiarity = self.grid, self.place, self.familiarity
         nearest, bearing = boundary.respond_compiled(
             speed_m_s, heading_rad, wall_m, wall_bearing_rad, dt_s
         )
@@ -317,7 +315,7 @@ class NavigationCells(Population):
                 here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
         else:
             columns = ([motion.v_m_s, heading], wall_m, bearing)
-            device = self._parts[1].errors.device
+            device = self.walls.errors.device
             (speed, course), *felt_walls = (
                 torch.as_tensor(column, dtype=torch.float64, device=device) for column in columns
             )
@@ -328,7 +326,7 @@ class NavigationCells(Population):
     @property
     def heading_error_rad(self) -> float:
         """Learnt error of the measured heading of one animal, which is subtracted from it."""
-        arrays = self._parts[1].arrays()  # of torch a number takes longer
+        arrays = self.walls.arrays()  # of torch a number takes longer
         return float((self.walls.errors if arrays is None else arrays[4])[0, 1])
 
     @property
