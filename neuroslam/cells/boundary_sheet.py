@@ -273,10 +273,9 @@ class BoundarySheet(nn.Module):
             bearing_rad: Its bearing, the same shape.
         """
         if distance_m.dim() == 1 and runs_compiled(distance_m, bearing_rad, self.warped_m):
-            walls = (
-                part.to(self.warped_m).contiguous().numpy() for part in (distance_m, bearing_rad)
-            )
-            return torch.from_numpy(respond_step(*walls, *self._numbers()))
+            felt_m = distance_m.to(self.warped_m).contiguous().numpy()
+            felt_rad = bearing_rad.to(self.warped_m).contiguous().numpy()
+            return torch.from_numpy(respond_step(felt_m, felt_rad, *self._numbers()))
         axes = self.bearings_rad, self.warped_m
         walls = distance_m.to(self.warped_m), bearing_rad.to(self.warped_m)
         return self.interact(warped_tuning(*walls, axes, self.config))

@@ -106,9 +106,6 @@ class NavigationCells(Population):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
-        self._parts = (
-            self.boundary, self.walls, self.oscillators, self.grid, self.place, self.familiarity,
-        )  # fmt: skip
         self._senses = cells_sense
         self.now = NavigationState(config.map.initial_heading_deg)
         # Pose at which each view was learnt; ``sure`` is 0 if the animal was lost.
@@ -147,10 +144,10 @@ class NavigationCells(Population):
             check_walls(wall_m, wall_bearing_rad)
         _check_duration(dt_s)
         if self._compiles() and runs_compiled(wall_m):
-            walls = (
-                np.ascontiguousarray(w.numpy(), np.float64) for w in (wall_m, wall_bearing_rad)
-            )
-            return self._step(float(speed_m_s), float(heading_rad), dt_s, *walls, compass, read)
+            felt_m = np.ascontiguousarray(wall_m.numpy(), np.float64)
+            felt_rad = np.ascontiguousarray(wall_bearing_rad.numpy(), np.float64)
+            speed, heading = float(speed_m_s), float(heading_rad)
+            return self._step(speed, heading, dt_s, felt_m, felt_rad, compass, read)
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -200,9 +197,8 @@ class NavigationCells(Population):
 
     def _compiles(self) -> bool:
         """Return whether the steps of this process and of these cells are compiled."""
-        return self.batch is None and runs_compiled(self._parts[1].errors)
+        return self.batch is None and runs_compiled(self.walls.errors)
 
-    @without_gradients
     def _step(
         self,
         speed_m_s: float,
@@ -214,7 +210,8 @@ class NavigationCells(Population):
         read: bool = False,
     ) -> NavigationEstimate:
         """Do as :meth:`forward` for one animal by compiled steps."""
-        boundary, memory, oscillators, grid, place, familiarity = self._parts
+        boundary, memory, oscillators = self.boundary, self.walls, self.oscillators
+        grid, place, familiarity = self.grid, self.place, self.familiarity
         nearest, bearing = boundary.respond_compiled(
             speed_m_s, heading_rad, wall_m, wall_bearing_rad, dt_s
         )
@@ -314,10 +311,11 @@ class NavigationCells(Population):
         wall_m, bearing = felt.T.copy()
         if self._compiles():
             _check_duration(motion.dt_s)
-            here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
+            with torch.inference_mode():
+                here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
         else:
             columns = ([motion.v_m_s, heading], wall_m, bearing)
-            device = self._parts[1].errors.device
+            device = self.walls.errors.device
             (speed, course), *felt_walls = (
                 torch.as_tensor(column, dtype=torch.float64, device=device) for column in columns
             )
@@ -328,7 +326,7 @@ class NavigationCells(Population):
     @property
     def heading_error_rad(self) -> float:
         """Learnt error of the measured heading of one animal, which is subtracted from it."""
-        arrays = self._parts[1].arrays()  # of torch a number takes longer
+        arrays = self.walls.arrays()  # of torch a number takes longer
         return float((self.walls.errors if arrays is None else arrays[4])[0, 1])
 
     @property

@@ -185,19 +185,20 @@ def _waves(parameters: SheetParameters) -> _Waves:
     once = (columns == 0) | (2 * columns == p.n_x)
     back = (np.where(once, 1.0, 2.0) / p.n_x)[:, None] * turn_x.T
     made = (
-        np.concatenate([turn_x.real, turn_x.imag], axis=1),
-        np.stack([shift_x.real, shift_x.imag]),
+        np.concatenate([np.real(turn_x), np.imag(turn_x)], axis=1),
+        np.stack([np.real(shift_x), np.imag(shift_x)]),
         _as_real(into_y),
-        own.real[np.ix_(rows, columns)],
+        np.real(own)[np.ix_(rows, columns)],
         _as_real(turn_y.conj().T / p.n_y),
-        np.concatenate([back.real, back.imag]),
+        np.concatenate([np.real(back), np.imag(back)]),
     )
     return _Waves(*(np.ascontiguousarray(part, np.float32) for part in made))
 
 
 def _as_real(matrix: np.ndarray) -> np.ndarray:
     """Return a complex matrix as one of real numbers, for vectors whose real parts come first."""
-    return np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
+    real, imaginary = np.real(matrix), np.imag(matrix)
+    return np.block([[real, -imaginary], [imaginary, real]])
 
 
 @compiled

@@ -276,10 +276,10 @@ class SpeedCells(Population):
         """
         c = self.config
         if self.batch is None and c.noise_hz == 0.0 and runs_compiled(self.rates_hz):
-            *tuning, smoothed, rates, _ = cast(Arrays, self.arrays())
+            rest, slope, lead, smoothed, rates, _ = cast(Arrays, self.arrays())
             rates_step(
-                abs(float(motion.v_m_s)), motion.dt_s, c.smooth_s, c.max_speed_m_s, *tuning,
-                smoothed, rates,
+                abs(float(motion.v_m_s)), motion.dt_s, c.smooth_s, c.max_speed_m_s, rest, slope,
+                lead, smoothed, rates,
             )  # fmt: skip
             return
         speed = torch.as_tensor(motion.v_m_s, dtype=torch.float64, device=self.rates_hz.device)

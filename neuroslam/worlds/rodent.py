@@ -9,7 +9,7 @@ with the columns ``time_s``, ``x_m`` and ``y_m``.
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -332,15 +332,16 @@ class _Room:
         """Return the positions of a walk from a pose, ``(n + 1, 2)``."""
         path = np.empty((len(lengths) + 1, 2))
         path[0] = x, y
-        given = (lengths, turns, self.distance_m)
-        rest = (*self.low, self.cell_m, self.margin_m)
+        lengths, turns = map(np.ascontiguousarray, (lengths, turns))
+        given: list[Any] = [path, theta, lengths, turns, self.distance_m]
+        given += [*self.low, self.cell_m, self.margin_m, _ESCAPES]
         if steps.ENABLED:
-            walk_steps(path, theta, *map(np.ascontiguousarray, given), *rest, _ESCAPES)
+            walk_steps(*given)
             return path
         # Nested lists: reading single numbers is five times as fast as from an array.
-        slow = path.tolist()
-        walk_steps.plain(slow, theta, *(part.tolist() for part in given), *rest, _ESCAPES.tolist())
-        return np.array(slow)
+        slow = [part.tolist() if isinstance(part, np.ndarray) else part for part in given]
+        walk_steps.plain(*slow)
+        return np.array(slow[0])
 
 
 def ratinabox_walk(arena: Arena, minutes: float, seed: int, rate_hz: float = 20.0) -> Walk:

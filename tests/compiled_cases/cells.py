@@ -30,6 +30,7 @@ from neuroslam.config import (
     PlaceCellConfig,
     WallMemoryConfig,
 )
+from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.types import Motion
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
@@ -251,6 +252,17 @@ def scans(rng):
     expected = arena._cast(points, np.column_stack([np.cos(angle), np.sin(angle)]))
     got = arena.ranges(points, headings, beams, np.inf)
     return [(expected.reshape(got.shape), got)]
+
+
+@case("sensors.scan.find_walls")
+def walls_of_scans(rng):
+    arena = named_arena(rng.choice(["triangle", "pillar", "two_rooms", "circle1m"]))
+    low, high = np.reshape(arena.bounds, (2, 2)).T
+    points = rng.uniform(low, high, (12, 2))
+    points, reach_m = points[arena.contains(points)], rng.choice([0.5, 5.0])
+    scans = arena.ranges(points, np.zeros(len(points)), int(rng.integers(36, 200)), reach_m)
+    scans = np.maximum(scans + rng.normal(0.0, 0.01, scans.shape), 0.0)
+    return with_and_without(lambda: [walls_in_scan(scan, 0.3) for scan in scans])
 
 
 @case("worlds.rodent.walk_steps")
