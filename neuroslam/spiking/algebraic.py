@@ -75,17 +75,32 @@ class AlgebraicIntegrator(Packet):
         c, dt = self.config, self.time_step_s
         turn = (velocity_m_s * dt) @ self.space.wave_vectors.T
         if c.phase_noise_rad > 0:
-            self._draw.set_state(self.generator_state)
-            noise = torch.randn(turn.shape, generator=self._draw).to(turn)
-            self.generator_state = self._draw.get_state()
-            turn = turn + c.phase_noise_rad * math.sqrt(dt) * noise
+            turn = turn + self.noise(1)[0].to(turn)
         z = self.z
         pull = coupled(z, pull, self.position_m, self.space, c)
         if pull is not None:
-            z = z + pull * (1.0 - math.exp(-dt / c.tau_s))
+            z = z + pull * self.share
         z = z / z.abs().clamp_min(1e-6) * torch.polar(torch.ones_like(turn), turn)
         self.phasor = torch.view_as_real(z)
         return self.locate(velocity_m_s)
+
+    @property
+    def share(self) -> float:
+        """Share of a correction that acts in a step."""
+        return 1.0 - math.exp(-self.time_step_s / self.config.tau_s)
+
+    def noise(self, steps: int) -> Tensor:
+        """Draw the noise of the phases in some steps, rad, ``(steps, batch, n_frequencies)``.
+
+        Empty, ``(0, 0, 0)``, if there is none.
+        """
+        c, (batch, k, _) = self.config, self.phasor.shape
+        if c.phase_noise_rad == 0:
+            return torch.zeros(0, 0, 0)
+        self._draw.set_state(self.generator_state)
+        each = [torch.randn((batch, k), generator=self._draw) for _ in range(steps)]
+        self.generator_state = self._draw.get_state()
+        return c.phase_noise_rad * math.sqrt(self.time_step_s) * torch.stack(each)
 
 
 class AlgebraicMap(BufferModule):
@@ -136,12 +151,17 @@ class AlgebraicMap(BufferModule):
     ) -> Tensor:
         """Recall a key's value and learn; see :class:`~.associative.AssociativeMap`."""
         recall = torch.bmm(key.unsqueeze(1), self.weights.mT).squeeze(1)
-        rate = seen * (1.0 - math.exp(-self.config.learning_rate_s * self.time_step_s))
+        rate = seen * self.share
         rate = rate if plasticity is None else rate * plasticity
         error = (value - recall) * rate.unsqueeze(-1)
         unit = key / key.square().sum(-1, keepdim=True).clamp_min(1e-6)
         self.weights = self.weights.baddbmm(error.unsqueeze(-1), unit.unsqueeze(-2))
         return recall
+
+    @property
+    def share(self) -> float:
+        """Share of the error that is learnt in a step."""
+        return 1.0 - math.exp(-self.config.learning_rate_s * self.time_step_s)
 
     @torch.no_grad()
     def read(self, keys: Tensor) -> Tensor:

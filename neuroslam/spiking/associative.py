@@ -1,5 +1,6 @@
 """The semantic map: an associative memory in neurons from landmarks to positions."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -7,13 +8,16 @@ from neuroslam.config.semantic import NeuronConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     Tuning,
+    filtered,
     lowpass,
     rates,
+    replace,
     sample_tuning,
     solve_decoders,
     synapse,
+    view,
 )
-from neuroslam.spiking.learning import pes_step, voja_step
+from neuroslam.spiking.learning import memorise, pes_step, voja_step
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
@@ -123,6 +127,16 @@ class AssociativeMap(BufferModule):
             The recall, filtered, ``(batch, n_value)``.
         """
         c, dt = self.config, self.time_step_s
+        inputs = key, value, seen, *(part for part in (plasticity, voja) if part is not None)
+        state = self.encoders, self.decoders, self.rule, self.recalled, self.taught
+        if self.memory.runs_compiled(*inputs, *state):
+            numbers = [part.to(key).contiguous().numpy() for part in inputs[2:]]
+            learns = np.ones_like(numbers[0]) if plasticity is None else numbers[1]
+            moves = numbers[0] if voja is None else numbers[-1]
+            recall = self.advance(
+                key.contiguous().numpy(), value.contiguous().numpy(), numbers[0], learns, moves
+            )
+            return torch.from_numpy(recall)
         # In this order; the other one takes seven times as long.
         current = self.memory.bias + torch.bmm(key.unsqueeze(1), self.encoders.mT).squeeze(1)
         spikes = self.memory.fire((self.memory.charged * (1.0 - current)).unsqueeze(0))[0]
@@ -145,6 +159,45 @@ class AssociativeMap(BufferModule):
         self.taught = lowpass(self.taught, value, synapse(_TAU_TEACHER_S, dt))
         self.rule = lowpass(self.rule, error_now, kept)
         return self.recalled
+
+    def advance(
+        self,
+        key: np.ndarray,
+        value: np.ndarray,
+        seen: np.ndarray,
+        plasticity: np.ndarray,
+        voja: np.ndarray,
+    ) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arguments are its own."""
+        c, dt, memory, error = self.config, self.time_step_s, self.memory, self.error
+        encoders, recalled = view(self, "encoders"), view(self, "recalled")
+        # A large product: that of torch is quicker than a loop, and adds in an order of its own.
+        said = torch.bmm(torch.from_numpy(key).unsqueeze(1), self.encoders.mT).squeeze(1).numpy()
+        kind, share = said.dtype.type, memory.charged
+        drive = kind(share) * (kind(1.0) - (view(memory, "bias") + said))
+        spikes = memory.fire_compiled(drive)[0]
+        relayed, taught, rule = (view(self, n) for n in ("relayed", "taught", "rule"))
+        silenced = kind(error.charged * _INHIBITION) * (kind(1.0) - seen)
+        error_decoders = view(self, "error_decoders")
+        error_now = error.respond((relayed - taught)[None], error_decoders, silenced)[0]
+        passed = recalled
+        if c.relay:
+            passed = self.relay.respond(passed[None], view(self, "relay_decoders"))[0]
+        numbers = np.array([1.0 / dt, synapse(_TAU_RECALL_S, dt)], dtype=kind)
+        wrong = rule * (kind(c.pes_rate * dt / c.neurons) * plasticity[:, None])
+        decoded = memorise(
+            spikes, key, wrong, kind(c.voja_rate) * voja, view(self, "gain"), encoders,
+            view(self, "decoders"), view(self, "activity_hz"), numbers,
+        )  # fmt: skip
+        recalled = filtered(recalled, decoded, synapse(_TAU_RECALL_S, dt))
+        replace(
+            self,
+            recalled=recalled,
+            relayed=filtered(relayed, passed, synapse(_TAU_ERROR_S, dt)),
+            taught=filtered(taught, value, synapse(_TAU_TEACHER_S, dt)),
+            rule=filtered(rule, error_now, synapse(_TAU_ERROR_S, dt)),
+        )
+        return recalled
 
     def error_output(self, seen: Tensor) -> Tensor:
         """Step the neurons of the error; return their unfiltered output, ``(batch, n_value)``."""

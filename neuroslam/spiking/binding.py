@@ -2,11 +2,21 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    lowpass,
+    replace,
+    sample_tuning,
+    solve_decoders,
+    synapse,
+    view,
+)
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 1000
@@ -77,6 +87,12 @@ class SpikingBinding(BufferModule):
             a: Complex, ``(batch, n_frequencies)``, parts in [-1, 1].
             b: The same.
         """
+        if self.neurons.runs_compiled(a, b, self.product, self.decoders):
+            left, right = (
+                torch.view_as_real(z.resolve_conj()).to(self.product).contiguous().numpy()
+                for z in (a, b)
+            )
+            return torch.view_as_complex(torch.from_numpy(self.advance(left, right)))
         # Rows: real·real, imaginary·imaginary, real·imaginary, imaginary·real.
         left = torch.stack([a.real, a.imag, a.real, a.imag])
         right = torch.stack([b.real, b.imag, b.imag, b.real])
@@ -88,3 +104,43 @@ class SpikingBinding(BufferModule):
         product = torch.stack([rr - ii, ri + ir], dim=-1).transpose(0, 1)
         self.product = lowpass(self.product, product, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.product)
+
+    def advance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
+        decoders = view(self, "decoders").reshape(8 * a.shape[1], -1, 1)
+        squares = self.neurons.respond(sums_and_differences(a, b), decoders)
+        kept = synapse(TAU_S, self.time_step_s)
+        product = products_of(squares, view(self, "product"), kept)
+        replace(self, product=product)
+        return product
+
+
+@compiled
+def sums_and_differences(a, b):  # noqa: ANN001, ANN202
+    """Return what the populations square, ``(8 n_frequencies, batch, 1)``."""
+    batch, n = a.shape[0], a.shape[1]
+    x = np.empty((8 * n, batch, 1), dtype=a.dtype)
+    for i in range(batch):
+        for k in range(n):
+            for row in range(4):
+                left = a[i, k, row % 2] / _RADIUS
+                right = b[i, k, (row + row // 2) % 2] / _RADIUS
+                x[row * n + k, i, 0] = left + right
+                x[(4 + row) * n + k, i, 0] = left - right
+    return x
+
+
+@compiled
+def products_of(squares, before, kept):  # noqa: ANN001, ANN202
+    """Return the filtered products, of the shape of those before, ``(batch, n_frequencies, 2)``."""
+    batch, n = before.shape[0], before.shape[1]
+    product = np.empty_like(before)
+    for i in range(batch):
+        for k in range(n):
+            rr = 0.5 * (squares[k, i, 0] - squares[4 * n + k, i, 0])
+            ii = 0.5 * (squares[n + k, i, 0] - squares[5 * n + k, i, 0])
+            ri = 0.5 * (squares[2 * n + k, i, 0] - squares[6 * n + k, i, 0])
+            ir = 0.5 * (squares[3 * n + k, i, 0] - squares[7 * n + k, i, 0])
+            product[i, k, 0] = (rr - ii) + kept * (before[i, k, 0] - (rr - ii))
+            product[i, k, 1] = (ri + ir) + kept * (before[i, k, 1] - (ri + ir))
+    return product

@@ -3,15 +3,20 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.neurons import (
     LIFState,
     Membrane,
+    fire_row,
+    lif_constants,
     lif_rate,
     lif_step,
+    respond,
     resting,
     stepped_lif,
     stepped_lif_rate,
@@ -138,6 +143,26 @@ def lowpass(filtered: Tensor, value: Tensor, kept: float) -> Tensor:
     return torch.lerp(value, filtered, kept)
 
 
+def view(module: BufferModule, name: str) -> np.ndarray:
+    """Return a buffer as an array that shares its memory, for compiled steps."""
+    buffer = module._buffers[name]
+    assert buffer is not None
+    if not buffer.is_contiguous():
+        module._buffers[name] = buffer = buffer.contiguous()
+    return buffer.numpy()
+
+
+def replace(module: BufferModule, **arrays: np.ndarray) -> None:
+    """Set buffers to arrays."""
+    for name, array in arrays.items():
+        module._buffers[name] = torch.from_numpy(array)
+
+
+def filtered(before: np.ndarray, value: np.ndarray, kept: float) -> np.ndarray:
+    """Filter arrays as :func:`lowpass` does."""
+    return value + before.dtype.type(kept) * (before - value)
+
+
 class NeuronArray(BufferModule):
     """Populations of the same size, side by side: currents in, spikes out.
 
@@ -187,6 +212,7 @@ class NeuronArray(BufferModule):
         self.register_buffer("deficit", state.deficit)
         self.register_buffer("asleep", state.asleep)
         self.register_buffer("spikes", torch.zeros_like(state.deficit), persistent=False)
+        self._folded: _Folded | None = None
 
     @property
     def charged(self) -> float:
@@ -233,6 +259,8 @@ class NeuronArray(BufferModule):
         model = self.config.model
         if model in ("lif_rate", "relu"):
             return rates(1.0 - drive / self.charged, self.config) * self.time_step_s
+        if self.runs_compiled(drive):
+            return torch.from_numpy(self.fire_compiled(drive.contiguous().numpy()).copy())
         step = lif_step if model == "lif" else stepped_lif
         state = LIFState(self.deficit, self.asleep)
         state, fired = step(state, drive, self.membrane, self.time_step_s)
@@ -240,7 +268,87 @@ class NeuronArray(BufferModule):
         self.spikes = fired
         return fired
 
+    def runs_compiled(self, *tensors: Tensor) -> bool:
+        """Return whether a compiled step may advance the neurons and take these tensors."""
+        if self.config.model not in ("lif", "stepped_lif"):
+            return False
+        state = self._buffers["weights"], self._buffers["deficit"], self._buffers["asleep"]
+        return runs_compiled(*tensors, *state)  # type: ignore[arg-type]
+
+    def respond(
+        self, x: np.ndarray, decoders: np.ndarray, more: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Step with vectors as input, and decode, in one compiled pass.
+
+        The spikes of :meth:`forward` times the decoders.
+
+        Args:
+            x: ``(groups, batch, dimensions)``.
+            decoders: ``(groups, neurons, outputs)``.
+            more: Added to the drive of an animal's neurons, ``(batch,)``; see :meth:`fire`.
+
+        Returns:
+            ``(groups, batch, outputs)``.
+        """
+        folded = self._constants()
+        deficit = view(self, "deficit")
+        if more is None:
+            more = np.zeros(deficit.shape[1], dtype=deficit.dtype)
+        state = deficit, view(self, "asleep"), self._spikes(deficit)
+        return respond(x, more, folded.slopes, folded.rest, *state, decoders, folded.lif)
+
+    def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
+        """Step as :meth:`fire` does, in one compiled pass."""
+        deficit = view(self, "deficit")
+        state = deficit, view(self, "asleep"), self._spikes(deficit)
+        fire_row(drive.reshape(-1), *(each.reshape(-1) for each in state), self._constants().lif)
+        return state[-1]
+
+    def _spikes(self, deficit: np.ndarray) -> np.ndarray:
+        spikes = view(self, "spikes")
+        if spikes.shape != deficit.shape or spikes.dtype != deficit.dtype:
+            replace(self, spikes=np.zeros_like(deficit))  # of a state that was put in
+            spikes = view(self, "spikes")
+        return spikes
+
+    def _constants(self) -> "_Folded":
+        """Return what follows from weights and biases; renewed with them."""
+        weights, bias = self._buffers["weights"], self._buffers["bias"]
+        assert weights is not None
+        assert bias is not None
+        versions = _version(weights), _version(bias)
+        known = self._folded
+        if (
+            known is None
+            or known.weights is not weights
+            or known.bias is not bias
+            or known.versions != versions
+        ):
+            share = self.charged
+            slopes = (-share * weights).mT.contiguous().numpy()
+            rest = (share * (1.0 - bias)).contiguous().numpy()
+            stepped = self.config.model == "stepped_lif"
+            lif = lif_constants(self.membrane, self.time_step_s, stepped, rest.dtype)
+            self._folded = known = _Folded(weights, bias, versions, slopes, rest, lif)
+        return known
+
     def silence(self) -> None:
         """Reset all neurons to rest, at distance 1 from threshold."""
         self.deficit = torch.ones_like(self.deficit)
         self.asleep = torch.zeros_like(self.asleep)
+
+
+class _Folded(NamedTuple):
+    """What compiled steps take of neurons, and of which weights and biases it is made."""
+
+    weights: Tensor
+    bias: Tensor
+    versions: tuple[int, int]
+    slopes: np.ndarray
+    rest: np.ndarray
+    lif: np.ndarray
+
+
+def _version(tensor: Tensor) -> int:
+    """Return how often a tensor was changed in place; 0 where torch does not count."""
+    return 0 if tensor.is_inference() else tensor._version

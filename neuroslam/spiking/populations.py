@@ -2,11 +2,21 @@
 
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    filtered,
+    lowpass,
+    replace,
+    sample_tuning,
+    solve_decoders,
+    synapse,
+    view,
+)
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.state.mergeable import BufferModule
 
@@ -136,10 +146,21 @@ class VectorPopulation(BufferModule):
 
     def forward(self, z: Tensor) -> Tensor:
         """Step with a vector; return the decoded vector, both complex, ``(batch, k)``."""
+        if self.neurons.runs_compiled(z, self.decoded, self.decoders):
+            parts = torch.view_as_real(z.resolve_conj()).to(self.decoded).contiguous()
+            return torch.view_as_complex(torch.from_numpy(self.advance(parts.numpy())))
         spikes = self.neurons(torch.view_as_real(z).flatten(-2).unsqueeze(0))[0]
         said = (spikes @ self.decoders).reshape(self.decoded.shape)
         self.decoded = lowpass(self.decoded, said, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.decoded)
+
+    def advance(self, z: np.ndarray) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
+        x = z.reshape(1, len(z), -1)
+        said = self.neurons.respond(x, view(self, "decoders")[None]).reshape(z.shape)
+        decoded = filtered(view(self, "decoded"), said, synapse(TAU_S, self.time_step_s))
+        replace(self, decoded=decoded)
+        return decoded
 
 
 def _uniform(region_m: Tensor, n: int, draw: torch.Generator) -> Tensor:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import NeuronConfig, SSPSLAMConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
@@ -15,19 +16,29 @@ from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, r
 from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.correction import SpikingCorrection
-from neuroslam.spiking.ensemble import lowpass, synapse
-from neuroslam.spiking.path_integrator import PathIntegrator
+from neuroslam.spiking.ensemble import filtered, lowpass, replace, synapse, view
+from neuroslam.spiking.path_integrator import REREAD_STEPS, PathIntegrator
 from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.quantise import on_chip, quantised
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.vector_steps import (
+    KNOWN,
+    Sights,
+    VectorState,
+    advance,
+    after_recalls,
+    before_recalls,
+    encode_all,
+    fourier_of,
+    times,
+)
 from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
 from neuroslam.worlds.landmarks import LandmarkView
 
 _CHUNK = 200  # steps whose inputs are prepared together
 _GATE_WIDTH = 0.02  # range of similarity over which the gate opens
-_KNOWN = 0.5  # strength of recall above which a landmark is known
 _SETTLED_S = 0.15  # time until neurons represent a landmark and its position is learnt
 _AREA_INTERCEPT = 0.05  # similarity above which cells of the position memory fire
 _CONTRADICTS, _AGREES = 0.5, 0.7  # similarities; side lobes of a space are below the first
@@ -225,6 +236,8 @@ class SSPSLAM(BufferModule):
             SpaceError: If anything does not fit or is not a number; nothing has changed then.
         """
         velocity, sight = self._inputs(velocity_m_s.unsqueeze(0), with_time(view))
+        if self._runs_compiled(velocity, *sight[:2]):
+            return SSPStep(*(part[0] for part in self._compiled(velocity, sight)))
         return self._step(velocity[0], *(part[0] for part in sight))
 
     @torch.inference_mode()
@@ -247,18 +260,183 @@ class SSPSLAM(BufferModule):
         Returns:
             Results, with the steps in front.
         """
-        results = []
-        for begin in range(0, len(velocity_m_s), _CHUNK):
+        n, kept = len(velocity_m_s), [k for k in range(every - 1, len(velocity_m_s), every)]
+        kept = kept or [n - 1]
+        results: list[SSPStep] = []
+        for begin in range(0, n, _CHUNK):
             part = slice(begin, begin + _CHUNK)
             velocity, sight = self._inputs(velocity_m_s[part], cut(view, part))
+            mine = [k - begin for k in kept if begin <= k < begin + len(velocity)]
+            if watch is None and self._runs_compiled(velocity, *sight[:2]):
+                results.append(SSPStep(*(each[mine] for each in self._compiled(velocity, sight))))
+                continue
+            steps: list[SSPStep] = []
             for k, v in enumerate(velocity):
-                step = self._step(v, *(p[k] for p in sight))
+                now = Sight(*(each[k : k + 1] for each in sight))
+                if self._runs_compiled(v, *now[:2]):
+                    step = SSPStep(*(each[0] for each in self._compiled(v.unsqueeze(0), now)))
+                else:
+                    step = self._step(v, *(each[0] for each in now))
                 if watch is not None:
                     watch(begin + k, step)
-                last = begin + k + 1 == len(velocity_m_s)
-                if (begin + k + 1) % every == 0 or (last and not results):
-                    results.append(step)
-        return SSPStep(*(torch.stack(column) for column in zip(*results, strict=True)))
+                if k in mine:
+                    steps.append(step)
+            if steps:
+                results.append(SSPStep(*(torch.stack(each) for each in zip(*steps, strict=True))))
+        return SSPStep(*(torch.cat(each) for each in zip(*results, strict=True)))
+
+    def _runs_compiled(self, *inputs: Tensor) -> bool:
+        """Return whether compiled steps may take these inputs and the state."""
+        if self.correction is not None:
+            return False
+        space, walk = self.space, self.integrator
+        tensors = (
+            *inputs, self.gate, self.gain, space.frequencies, space.length_scale_m, self.pull,
+            self.recalled, walk.position_m,
+        )  # fmt: skip
+        if isinstance(walk, PathIntegrator):
+            memory = cast(AssociativeMap, self.map)
+            populations = walk.neurons, memory.memory
+            return all(each.runs_compiled(walk.output) for each in populations) and runs_compiled(
+                *tensors, memory.decoders, memory.rule
+            )
+        memory = cast(AlgebraicMap, self.map)
+        return runs_compiled(*tensors, walk.phasor, memory.weights)
+
+    def _compiled(self, velocity: Tensor, sight: Sight) -> SSPStep:
+        """Advance some steps as :meth:`_step` does, compiled; results lead with the steps."""
+        if self.config.tier == "algebraic":
+            return self._compiled_vectors(velocity, sight)
+        numbers = tuple(
+            part.contiguous().numpy()
+            for part in (velocity, sight.key, torch.view_as_real(sight.vector), sight.held_s)
+        )
+        seen = (sight.attended != NOTHING).numpy()
+        model, flags = self._gate_constants(view(self, "pull").dtype)
+        found = [
+            self._compiled_step(*(part[k] for part in numbers), seen[k], model, flags)
+            for k in range(len(velocity))
+        ]
+        self._count(sight)
+        position, z, says = (
+            torch.from_numpy(np.stack(each)) for each in zip(*found, strict=True)
+        )
+        return _steps_of(position, z, says, sight.attended)
+
+    def _gate_constants(self, kind: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Return the constants of ``vector_steps.before_recall`` and ``after_recall``."""
+        c, dt = self.config, self.config.time_step_s
+        settled = 1.5 * dt if c.tier == "algebraic" else _SETTLED_S
+        model = np.array(
+            [settled, c.relocalise_after_s, c.map.least_plasticity, _CONTRADICTS, dt,
+             float(self.gate), _GATE_WIDTH, float(self.gain), _LOST_GAIN, _AGREES], dtype=kind,
+        )  # fmt: skip
+        novelty, never = c.map.plasticity == "novelty", c.relocalise_after_s == 0
+        return model, np.array([novelty, never, c.quantised, 0, 0, 0])
+
+    def _compiled_vectors(self, velocity: Tensor, sight: Sight) -> SSPStep:
+        """Advance vectors some steps, in one compiled call."""
+        c, dt = self.config, self.config.time_step_s
+        walk, memory = cast(AlgebraicIntegrator, self.integrator), cast(AlgebraicMap, self.map)
+        places = cast(AlgebraicMap | None, self.places)
+        kind = view(self, "pull").dtype
+        model, flags = self._gate_constants(kind)
+        flags[3:] = walk.coupling, walk.look_steps, REREAD_STEPS
+        numbers = np.array(
+            [dt, c.integrator.coupling_gain, walk.share, memory.share], dtype=kind
+        )
+        inputs = Sights(
+            velocity.contiguous().numpy(),
+            sight.key.contiguous().numpy(),
+            torch.view_as_real(sight.vector).contiguous().numpy(),
+            (sight.attended != NOTHING).numpy(),
+            sight.held_s.contiguous().numpy(),
+            walk.noise(len(velocity)).to(self.pull).numpy(),
+        )
+        state = VectorState(
+            view(walk, "phasor").copy(),
+            view(walk, "position_m").copy(),
+            view(memory, "weights").copy(),
+            np.zeros((0, 0, 0), kind) if places is None else view(places, "weights").copy(),
+            *(view(self, n).copy() for n in ("recalled", "pull", "familiar", "contradicted_s")),
+        )
+        position, z, says = advance(
+            tuple(walk.decoder.tables()), tuple(inputs), tuple(state), int(walk.age), numbers,
+            model, flags,
+        )  # fmt: skip
+        replace(walk, phasor=state.phasor, position_m=state.position)
+        walk.age = walk.age + len(velocity)
+        replace(memory, weights=state.weights)
+        if places is not None:
+            replace(places, weights=state.places)
+        replace(
+            self, recalled=state.recalled, pull=state.pull, familiar=state.familiar,
+            contradicted_s=state.contradicted,
+        )  # fmt: skip
+        self._count(sight)
+        return _steps_of(*(torch.from_numpy(each) for each in (position, z, says)), sight.attended)
+
+    def _count(self, sight: Sight) -> None:
+        """Note the time, and what is attended to, after some steps."""
+        time = float(self.time_s)
+        for _ in range(len(sight.held_s)):
+            time += self.config.time_step_s
+        self.time_s = torch.full_like(self.time_s, time)
+        self.attended, self.held_s = sight.attended[-1].clone(), sight.held_s[-1].clone()
+
+    def _compiled_step(
+        self,
+        velocity: np.ndarray,
+        key: np.ndarray,
+        vector: np.ndarray,
+        held_s: np.ndarray,
+        seen: np.ndarray,
+        model: np.ndarray,
+        flags: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Advance neurons one step; return position, coefficients, and what ``SSPStep`` says."""
+        walk, memory = cast(PathIntegrator, self.integrator), cast(AssociativeMap, self.map)
+        tables = walk.decoder.tables()
+        even, odd = tables.even, tables.odd
+        z = walk.advance(velocity, view(self, "pull"))
+        position = view(walk, "position_m")
+        here = encode_all(tables.waves, position)
+        sees = seen.astype(here.dtype)
+        if self.grid is not None:
+            here = self.grid.advance(here)
+        if self.vectors is not None:
+            vector = self.vectors.advance(vector) * sees[:, None, None]
+            here = self._late_array("here", here, TAU_VECTOR_S)
+        bind = self.binding
+        place = times(here, vector) if bind is None else bind.advance(here, vector)
+        contradicted = view(self, "contradicted_s").copy()
+        value, now = before_recalls(
+            even, odd, place, view(self, "recalled"), held_s, contradicted, seen, model, flags
+        )
+        recalled = fourier_of(even, odd, memory.advance(key, value, sees, now[:, 4], sees))
+        if self.places is not None:
+            places, learns = cast(AssociativeMap, self.places), now[:, 3]
+            places.advance(value * sees[:, None], key, sees, np.ascontiguousarray(learns), sees)
+        back = vector * np.array([1.0, -1.0], dtype=vector.dtype)
+        if self.unbinding is None:
+            implied = times(recalled, back)
+        else:
+            implied = self.unbinding.advance(recalled, back)
+            here = self._late_array("there", here, TAU_BINDING_S)
+        familiar = view(self, "familiar").copy()
+        said, pull = after_recalls(
+            implied, here, seen, familiar, contradicted, now, model, bool(flags[1])
+        )
+        replace(
+            self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted
+        )
+        return position, z, np.stack([now[:, 0], said[:, 0], said[:, 1], now[:, 1]], axis=-1)
+
+    def _late_array(self, name: str, z: np.ndarray, tau_s: float) -> np.ndarray:
+        """Delay as :meth:`_late` does."""
+        late = filtered(view(self, name), z, synapse(tau_s, self.config.time_step_s))
+        replace(self, **{name: late})
+        return late
 
     def _step(
         self, velocity: Tensor, key: Tensor, vector: Tensor, attended: Tensor, held_s: Tensor
@@ -293,10 +471,10 @@ class SSPSLAM(BufferModule):
             here = self._late("there", here, TAU_BINDING_S)
         agreement = (implied.real * here.real + implied.imag * here.imag).mean(-1)
         # What is learnt in the present visit is no more accurate than the position.
-        familiar = torch.where(settled, self.familiar, strength > _KNOWN)
+        familiar = torch.where(settled, self.familiar, strength > KNOWN)
         known = familiar & settled & (seen > 0)
         gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * known
-        self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
+        self._note_contradiction(known, agreement / strength.clamp_min(KNOWN))
         unit = implied / implied.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
         apart = unit - here
@@ -426,6 +604,14 @@ class SSPSLAM(BufferModule):
                 f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
             )
         return position
+
+
+def _steps_of(position: Tensor, z: Tensor, says: Tensor, attended: Tensor) -> SSPStep:
+    """Return results of compiled steps: ``says`` are strength, agreement, gate and lost."""
+    strength, agreement, gate, lost = says.unbind(-1)
+    return SSPStep(
+        position, torch.view_as_complex(z), strength, agreement, gate, lost != 0, attended
+    )
 
 
 def _checked_names(names: Sequence[str], n: int) -> tuple[str, ...]:
