@@ -1,5 +1,7 @@
 """The semantic map: an associative memory in neurons from landmarks to positions."""
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -8,7 +10,6 @@ from neuroslam.config.semantic import NeuronConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     Tuning,
-    filtered,
     lowpass,
     rates,
     replace,
@@ -87,6 +88,7 @@ class AssociativeMap(BufferModule):
         super().__init__()
         self.config = config
         self.time_step_s = time_step_s
+        self._rates: np.ndarray | None = None  # constants of compiled steps
         draw = torch.Generator().manual_seed(seed)
         n = config.neurons
         near = None
@@ -169,35 +171,45 @@ class AssociativeMap(BufferModule):
         voja: np.ndarray,
     ) -> np.ndarray:
         """Step as :meth:`forward` does, compiled; arguments are its own."""
-        c, dt, memory, error = self.config, self.time_step_s, self.memory, self.error
+        modules = self._modules
+        memory, error = (cast(NeuronArray, modules[name]) for name in ("memory", "error"))
         encoders, recalled = view(self, "encoders"), view(self, "recalled")
+        rates = self._rates
+        if rates is None or rates.dtype != recalled.dtype:
+            rates = self._rates = self._constants(recalled.dtype)
         # A large product: that of torch is quicker than a loop, and adds in an order of its own.
-        said = torch.bmm(torch.from_numpy(key).unsqueeze(1), self.encoders.mT).squeeze(1).numpy()
-        kind, share = said.dtype.type, memory.charged
-        drive = kind(share) * (kind(1.0) - (view(memory, "bias") + said))
-        spikes = memory.fire_compiled(drive)[0]
+        weights = cast(Tensor, self._buffers["encoders"])
+        said = torch.bmm(torch.from_numpy(key).unsqueeze(1), weights.mT).squeeze(1).numpy()
+        drive = rates[6] * (rates[7] - view(memory, "bias") - said)
+        spikes = memory.fire_compiled(drive[None])[0]
         relayed, taught, rule = (view(self, n) for n in ("relayed", "taught", "rule"))
-        silenced = kind(error.charged * _INHIBITION) * (kind(1.0) - seen)
+        silenced = rates[8] * (rates[7] - seen)
         error_decoders = view(self, "error_decoders")
         error_now = error.respond((relayed - taught)[None], error_decoders, silenced)[0]
         passed = recalled
-        if c.relay:
+        if self.config.relay:
             passed = self.relay.respond(passed[None], view(self, "relay_decoders"))[0]
-        numbers = np.array([1.0 / dt, synapse(_TAU_RECALL_S, dt)], dtype=kind)
-        wrong = rule * (kind(c.pes_rate * dt / c.neurons) * plasticity[:, None])
-        decoded = memorise(
-            spikes, key, wrong, kind(c.voja_rate) * voja, view(self, "gain"), encoders,
-            view(self, "decoders"), view(self, "activity_hz"), numbers,
+        rule, recalled, relayed, taught = memorise(
+            spikes, key, plasticity, voja, view(self, "gain"), encoders, view(self, "decoders"),
+            view(self, "activity_hz"), (rule, recalled, relayed, taught),
+            (error_now, passed, value), rates,
         )  # fmt: skip
-        recalled = filtered(recalled, decoded, synapse(_TAU_RECALL_S, dt))
-        replace(
-            self,
-            recalled=recalled,
-            relayed=filtered(relayed, passed, synapse(_TAU_ERROR_S, dt)),
-            taught=filtered(taught, value, synapse(_TAU_TEACHER_S, dt)),
-            rule=filtered(rule, error_now, synapse(_TAU_ERROR_S, dt)),
-        )
+        replace(self, rule=rule, recalled=recalled, relayed=relayed, taught=taught)
         return recalled
+
+    def _constants(self, kind: np.dtype) -> np.ndarray:
+        """Return the rates of ``memorise``, and those of the drive."""
+        c, dt = self.config, self.time_step_s
+        numbers = [
+            1.0 / dt,
+            c.pes_rate * dt / c.neurons,
+            c.voja_rate,
+            *(synapse(tau, dt) for tau in (_TAU_RECALL_S, _TAU_ERROR_S, _TAU_TEACHER_S)),
+            self.memory.charged,
+            1.0,
+            self.error.charged * _INHIBITION,
+        ]
+        return np.array(numbers, dtype=kind)
 
     def error_output(self, seen: Tensor) -> Tensor:
         """Step the neurons of the error; return their unfiltered output, ``(batch, n_value)``."""

@@ -64,7 +64,7 @@ class PositionDecoder:
     def __init__(self, space: SSPSpace) -> None:
         self.space = space
         self._waves: Tensor | None = None
-        self._tables: SpaceTables | None = None
+        self._tables: tuple[tuple[tuple[Tensor, int], ...], SpaceTables] | None = None
 
     def __call__(self, z: Tensor) -> Decoded:
         """Decode Fourier coefficients, complex, ``(..., n_frequencies)``.
@@ -123,12 +123,16 @@ class PositionDecoder:
 
     def tables(self) -> SpaceTables:
         """Return what compiled steps take of the space, on the CPU; renewed with it."""
-        points, cosines, sines = self._grid()
-        if self._tables is None:
-            waves = cast(Tensor, self._waves)
-            modules = self.space.grid_modules
+        own = self.space._parameters
+        made_of = cast(tuple[Tensor, Tensor], (own["frequencies"], own["length_scale_m"]))
+        known = self._tables
+        if known is None or any(
+            a is not b or n != _version(b) for (a, n), b in zip(known[0], made_of, strict=True)
+        ):
+            points, cosines, sines = self._grid()
+            waves, modules = cast(Tensor, self._waves), self.space.grid_modules
             longest = 1.0 / waves.abs().amax(0)
-            self._tables = SpaceTables(
+            tables = SpaceTables(
                 waves.numpy(),
                 self.space.bounds_m.contiguous().numpy(),
                 longest.numpy(),
@@ -138,7 +142,8 @@ class PositionDecoder:
                 sines.contiguous().numpy(),
                 *fourier_tables(self.space.n_features, waves.numpy().dtype),
             )
-        return self._tables
+            known = self._tables = tuple((p, _version(p)) for p in made_of), tables
+        return known[1]
 
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the points of the coarse search and the waves at them; renewed with the space."""
@@ -150,7 +155,6 @@ class PositionDecoder:
             or known.dtype != waves.dtype
             or not torch.equal(known, waves)
         ):
-            self._tables = None
             low, high = self.space.bounds_m.T
             each = ((high - low) * waves.abs().amax(0) / _STEP_RAD).ceil() + 1
             each = (each * min(1.0, (_MOST_POINTS / float(each.prod())) ** (1 / len(each)))).long()
@@ -162,6 +166,11 @@ class PositionDecoder:
             angle = points @ waves.T
             self._points, self._waves = (points, angle.cos().T, angle.sin().T), waves.clone()
         return self._points
+
+
+def _version(tensor: Tensor) -> int:
+    """Return how often a tensor was changed in place; 0 where torch does not count."""
+    return 0 if tensor.is_inference() else tensor._version
 
 
 class LearnedDecoder(nn.Module):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.compiled import runs_compiled
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.neurons import (
     LIFState,
@@ -143,24 +143,52 @@ def lowpass(filtered: Tensor, value: Tensor, kept: float) -> Tensor:
     return torch.lerp(value, filtered, kept)
 
 
+class _Views(dict[str, tuple[Tensor, np.ndarray]]):
+    """Arrays that share the memory of buffers; a copy of the module makes its own."""
+
+    def __deepcopy__(self, memo: object) -> "_Views":
+        return _Views()
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return _Views, ()
+
+
 def view(module: BufferModule, name: str) -> np.ndarray:
     """Return a buffer as an array that shares its memory, for compiled steps."""
     buffer = module._buffers[name]
+    views = module.__dict__.get("_views")
+    if views is None:
+        views = module.__dict__["_views"] = _Views()
+    known = views.get(name)
+    if known is not None and known[0] is buffer:
+        return known[1]
     assert buffer is not None
     if not buffer.is_contiguous():
         module._buffers[name] = buffer = buffer.contiguous()
-    return buffer.numpy()
+    array = buffer.numpy()
+    views[name] = buffer, array
+    return array
 
 
 def replace(module: BufferModule, **arrays: np.ndarray) -> None:
     """Set buffers to arrays."""
+    views = module.__dict__.get("_views")
+    if views is None:
+        views = module.__dict__["_views"] = _Views()
     for name, array in arrays.items():
-        module._buffers[name] = torch.from_numpy(array)
+        module._buffers[name] = buffer = torch.from_numpy(array)
+        views[name] = buffer, array
 
 
-def filtered(before: np.ndarray, value: np.ndarray, kept: float) -> np.ndarray:
-    """Filter arrays as :func:`lowpass` does."""
-    return value + before.dtype.type(kept) * (before - value)
+@compiled
+def filtered(before, value, kept):  # noqa: ANN001, ANN202
+    """Filter coefficients, ``(batch, n_frequencies, 2)``; :func:`lowpass` is the definition."""
+    after = np.empty_like(before)
+    for b in range(before.shape[0]):
+        for k in range(before.shape[1]):
+            for i in range(2):
+                after[b, k, i] = value[b, k, i] + kept * (before[b, k, i] - value[b, k, i])
+    return after
 
 
 class NeuronArray(BufferModule):
@@ -292,14 +320,22 @@ class NeuronArray(BufferModule):
         """
         folded = self._constants()
         deficit = view(self, "deficit")
+        groups, batch, n = deficit.shape
         if more is None:
-            more = np.zeros(deficit.shape[1], dtype=deficit.dtype)
+            more = np.zeros(batch, dtype=deficit.dtype)
+        if x.shape != (groups, batch, folded.slopes.shape[1]) or decoders.shape[:2] != (groups, n):
+            raise ValueError(
+                f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
+                f"(groups, batch, neurons) = {deficit.shape}"
+            )
         state = deficit, view(self, "asleep"), self._spikes(deficit)
         return respond(x, more, folded.slopes, folded.rest, *state, decoders, folded.lif)
 
     def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
         """Step as :meth:`fire` does, in one compiled pass."""
         deficit = view(self, "deficit")
+        if drive.shape != deficit.shape:
+            raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
         state = deficit, view(self, "asleep"), self._spikes(deficit)
         fire_row(drive.reshape(-1), *(each.reshape(-1) for each in state), self._constants().lif)
         return state[-1]

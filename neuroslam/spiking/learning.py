@@ -52,49 +52,76 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
 
 
 @compiled
-def memorise(spikes, key, error, voja, gain, encoders, decoders, activity, rates):  # noqa: ANN001, ANN202
-    """Decode, and learn in place, in one pass; ``AssociativeMap.forward`` is the definition.
+def memorise(  # noqa: ANN202
+    spikes,  # noqa: ANN001
+    key,  # noqa: ANN001
+    plasticity,  # noqa: ANN001
+    voja,  # noqa: ANN001
+    gain,  # noqa: ANN001
+    encoders,  # noqa: ANN001
+    decoders,  # noqa: ANN001
+    activity,  # noqa: ANN001
+    filters,  # noqa: ANN001
+    values,  # noqa: ANN001
+    rates,  # noqa: ANN001
+):
+    """Decode, learn in place, and filter, in one pass; ``AssociativeMap.forward`` is the definition.
 
     :func:`pes_step` and :func:`voja_step`, of neurons that have been active or fire alone.
 
     Args:
         spikes: In this step, ``(batch, neurons)``.
         key: ``(batch, n_key)``.
-        error: Times the rate of learning, ``(batch, n_value)``.
-        voja: Rate of the encoders, ``(batch,)``.
+        plasticity: Share of the rate of learning, ``(batch,)``.
+        voja: The same of the encoders.
         gain: Of the encoders, ``(neurons,)``.
         encoders: ``(batch, neurons, n_key)``.
         decoders: ``(batch, neurons, n_value)``.
         activity: Filtered rates in Hz, ``(batch, neurons)``.
-        rates: Rate of a spike in a step, and how much of its activity is kept.
+        filters: ``rule``, ``recalled``, ``relayed`` and ``taught``, each ``(batch, n_value)``.
+        values: What goes into the first, and into the last two; the same shape.
+        rates: Rate of a spike in a step, rates of PES and Voja, and how much is kept of activity and
+            recall, of the rule and what is relayed, and of what is taught.
 
     Returns:
-        What the spikes say, ``(batch, n_value)``.
+        ``filters`` after the step.
     """
     batch, neurons, n_value = decoders.shape
     n_key = encoders.shape[2]
-    decoded = np.zeros((batch, n_value), dtype=decoders.dtype)
+    per_spike, pes, move, recalls, errs, teaches = (
+        rates[0], rates[1], rates[2], rates[3], rates[4], rates[5],
+    )  # fmt: skip
+    rule, recalled, relayed, taught = filters
+    error_now, passed, value = values
+    new_rule, new_recalled = np.empty_like(rule), np.zeros_like(rule)
+    new_relayed, new_taught = np.empty_like(rule), np.empty_like(rule)
+    wrong = np.empty(n_value, dtype=rule.dtype)
     for b in range(batch):
-        said, wrong, name = decoded[b], error[b], key[b]
-        largest = 0.0
+        said, name = new_recalled[b], key[b]
+        largest, moves = 0.0, move * voja[b]
         for o in range(n_value):
+            wrong[o] = pes * (plasticity[b] * rule[b, o])
             largest = max(largest, abs(wrong[o]))
         for i in range(neurons):
             spike, row = spikes[b, i], decoders[b, i]
-            rate = spike * rates[0]
-            active = rate + rates[1] * (activity[b, i] - rate)
-            if active < NOTHING:
-                active = 0.0
-            activity[b, i] = active
-            active = activity[b, i]  # of the type of the arrays
+            rate = spike * per_spike
+            activity[b, i] = rate + recalls * (activity[b, i] - rate)
+            if activity[b, i] < NOTHING:
+                activity[b, i] = 0.0
+            active = activity[b, i]
             if spike != 0.0:
                 for o in range(n_value):
                     said[o] += rate * row[o]
             if active * largest > NOTHING:
                 for o in range(n_value):
                     row[o] -= active * wrong[o]
-            if spike != 0.0 and voja[b] != 0.0:
-                moved, far, mine = spike * voja[b], gain[i], encoders[b, i]
+            if spike != 0.0 and moves != 0.0:
+                moved, far, mine = spike * moves, gain[i], encoders[b, i]
                 for j in range(n_key):
                     mine[j] += moved * (far * name[j] - mine[j])
-    return decoded
+        for o in range(n_value):
+            said[o] += recalls * (recalled[b, o] - said[o])
+            new_rule[b, o] = error_now[b, o] + errs * (rule[b, o] - error_now[b, o])
+            new_relayed[b, o] = passed[b, o] + errs * (relayed[b, o] - passed[b, o])
+            new_taught[b, o] = value[b, o] + teaches * (taught[b, o] - value[b, o])
+    return new_rule, new_recalled, new_relayed, new_taught

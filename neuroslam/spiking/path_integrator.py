@@ -226,6 +226,7 @@ class PathIntegrator(Packet):
         super().__init__(space, config, time_step_s, batch)
         draw = torch.Generator().manual_seed(seed)
         k = space.n_frequencies
+        self._walk: np.ndarray | None = None  # constants of compiled steps
         tuning = sample_tuning(k, config.neurons, 3, neurons, draw, radius=_RADIUS)
         self.neurons = NeuronArray(tuning, neurons, time_step_s, draw, batch)
         for name in ("recurrent", "external", "output"):
@@ -314,13 +315,14 @@ class PathIntegrator(Packet):
         Returns:
             ``(batch, n_frequencies, 2)``.
         """
-        c, dt = self.config, self.time_step_s
         output, recurrent, external = (view(self, n) for n in ("output", "recurrent", "external"))
-        position = view(self, "position_m")
+        position, walk = view(self, "position_m"), self._walk
         if pull is None:
             pull = np.zeros((len(position), len(output), 2), dtype=output.dtype)
-        kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
-        walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
+        if walk is None or walk.dtype != output.dtype:
+            c, dt = self.config, self.time_step_s
+            kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
+            walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
         tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
         x, external = oscillators_before(
             tables.waves, tables.modules, output, recurrent, external, fastest, position, velocity, pull,
