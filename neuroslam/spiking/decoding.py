@@ -64,7 +64,7 @@ class PositionDecoder:
     def __init__(self, space: SSPSpace) -> None:
         self.space = space
         self._waves: Tensor | None = None
-        self._tables: tuple[tuple[tuple[Tensor, int], ...], SpaceTables] | None = None
+        self._tables: tuple[Tensor, Tensor, tuple[int, int], SpaceTables] | None = None
 
     def __call__(self, z: Tensor) -> Decoded:
         """Decode Fourier coefficients, complex, ``(..., n_frequencies)``.
@@ -124,10 +124,14 @@ class PositionDecoder:
     def tables(self) -> SpaceTables:
         """Return what compiled steps take of the space, on the CPU; renewed with it."""
         own = self.space._parameters
-        made_of = cast(tuple[Tensor, Tensor], (own["frequencies"], own["length_scale_m"]))
+        frequencies, scale = cast(Tensor, own["frequencies"]), cast(Tensor, own["length_scale_m"])
+        versions = _version(frequencies), _version(scale)
         known = self._tables
-        if known is None or any(
-            a is not b or n != _version(b) for (a, n), b in zip(known[0], made_of, strict=True)
+        if (
+            known is None
+            or known[0] is not frequencies
+            or known[1] is not scale
+            or known[2] != versions
         ):
             points, cosines, sines = self._grid()
             waves, modules = cast(Tensor, self._waves), self.space.grid_modules
@@ -142,8 +146,8 @@ class PositionDecoder:
                 sines.contiguous().numpy(),
                 *fourier_tables(self.space.n_features, waves.numpy().dtype),
             )
-            known = self._tables = tuple((p, _version(p)) for p in made_of), tables
-        return known[1]
+            known = self._tables = frequencies, scale, versions, tables
+        return known[3]
 
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the points of the coarse search and the waves at them; renewed with the space."""

@@ -1,7 +1,7 @@
 """Populations of neurons that represent vectors: tuning, decoders, synapses (NEF)."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -180,6 +180,17 @@ def replace(module: BufferModule, **arrays: np.ndarray) -> None:
         views[name] = buffer, array
 
 
+def may_share(module: BufferModule, *names: str) -> bool:
+    """Return whether compiled steps may take these buffers; quick for those that they have set."""
+    views = module.__dict__.get("_views") or {}
+    for name in names:
+        buffer = module._buffers[name]
+        known = views.get(name)
+        if (known is None or known[0] is not buffer) and not runs_compiled(cast(Tensor, buffer)):
+            return False
+    return True
+
+
 @compiled
 def filtered(before, value, kept):  # noqa: ANN001, ANN202
     """Filter coefficients, ``(batch, n_frequencies, 2)``; :func:`lowpass` is the definition."""
@@ -300,8 +311,8 @@ class NeuronArray(BufferModule):
         """Return whether a compiled step may advance the neurons and take these tensors."""
         if self.config.model not in ("lif", "stepped_lif"):
             return False
-        state = self._buffers["weights"], self._buffers["deficit"], self._buffers["asleep"]
-        return runs_compiled(*tensors, *state)  # type: ignore[arg-type]
+        weights = cast(Tensor, self._buffers["weights"])
+        return runs_compiled(weights, *tensors) and may_share(self, "deficit", "asleep")
 
     def respond(
         self, x: np.ndarray, decoders: np.ndarray, more: np.ndarray | None = None

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.ensemble import (
     NeuronArray,
     lowpass,
+    may_share,
     replace,
     sample_tuning,
     solve_decoders,
@@ -289,14 +289,17 @@ class PathIntegrator(Packet):
         Returns:
             Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.
         """
-        space, parts = self.space, [] if pull is None else [pull]
-        state = self.recurrent, self.external, self.output, self.position_m
-        if self.neurons.runs_compiled(velocity_m_s, *parts, *state) and runs_compiled(
-            space.frequencies, space.length_scale_m
+        space, neurons = self.space, self.neurons
+        own = space.frequencies, space.length_scale_m
+        given = (velocity_m_s,) if pull is None else (velocity_m_s, pull)
+        if (
+            velocity_m_s.shape == cast(Tensor, self._buffers["position_m"]).shape
+            and neurons.runs_compiled(*own, *given)
+            and may_share(self, "recurrent", "external", "output", "position_m")
         ):
-            velocity, numbers = velocity_m_s.to(self.output).contiguous().numpy(), None
+            velocity, numbers = velocity_m_s.to(own[0].dtype).contiguous().numpy(), None
             if pull is not None:
-                numbers = torch.view_as_real(pull).to(self.output).contiguous().numpy()
+                numbers = torch.view_as_real(pull).to(own[0].dtype).contiguous().numpy()
             return torch.view_as_complex(torch.from_numpy(self.advance(velocity, numbers)))
         waves = space.wave_vectors
         share = (velocity_m_s @ (waves / self.fastest_rad_s.unsqueeze(-1)).T).clamp(-1.0, 1.0)
