@@ -116,7 +116,7 @@ class SpikingBinding(BufferModule):
 
 
 @compiled
-def sums_and_differences(a, b):  # noqa: ANN001, ANN202
+def sums_and_differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return what the populations square, ``(8 n_frequencies, batch, 1)``."""
     batch, n = a.shape[0], a.shape[1]
     x = np.empty((8 * n, batch, 1), dtype=a.dtype)
@@ -131,7 +131,7 @@ def sums_and_differences(a, b):  # noqa: ANN001, ANN202
 
 
 @compiled
-def products_of(squares, before, kept):  # noqa: ANN001, ANN202
+def products_of(squares: np.ndarray, before: np.ndarray, kept: float) -> np.ndarray:
     """Return the filtered products, of the shape of those before, ``(batch, n_frequencies, 2)``."""
     batch, n = before.shape[0], before.shape[1]
     product = np.empty_like(before)

@@ -192,7 +192,7 @@ def may_share(module: BufferModule, *names: str) -> bool:
 
 
 @compiled
-def filtered(before, value, kept):  # noqa: ANN001, ANN202
+def filtered(before: np.ndarray, value: np.ndarray, kept: float) -> np.ndarray:
     """Filter coefficients, ``(batch, n_frequencies, 2)``; :func:`lowpass` is the definition."""
     after = np.empty_like(before)
     for b in range(before.shape[0]):
@@ -339,17 +339,21 @@ class NeuronArray(BufferModule):
                 f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
                 f"(groups, batch, neurons) = {deficit.shape}"
             )
-        state = deficit, view(self, "asleep"), self._spikes(deficit)
-        return respond(x, more, folded.slopes, folded.rest, *state, decoders, folded.lif)
+        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        return respond(
+            x, more, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif
+        )
 
     def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
         """Step as :meth:`fire` does, in one compiled pass."""
         deficit = view(self, "deficit")
         if drive.shape != deficit.shape:
             raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
-        state = deficit, view(self, "asleep"), self._spikes(deficit)
-        fire_row(drive.reshape(-1), *(each.reshape(-1) for each in state), self._constants().lif)
-        return state[-1]
+        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
+        now, owing, paused, fired = rows
+        fire_row(now, owing, paused, fired, self._constants().lif)
+        return spikes
 
     def _spikes(self, deficit: np.ndarray) -> np.ndarray:
         spikes = view(self, "spikes")

@@ -52,22 +52,23 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
 
 
 @compiled
-def memorise(  # noqa: ANN202
-    spikes,  # noqa: ANN001
-    key,  # noqa: ANN001
-    plasticity,  # noqa: ANN001
-    voja,  # noqa: ANN001
-    gain,  # noqa: ANN001
-    encoders,  # noqa: ANN001
-    decoders,  # noqa: ANN001
-    activity,  # noqa: ANN001
-    filters,  # noqa: ANN001
-    values,  # noqa: ANN001
-    rates,  # noqa: ANN001
-):
-    """Decode, learn in place, and filter, in one pass; ``AssociativeMap.forward`` is the definition.
+def memorise(
+    spikes: np.ndarray,
+    key: np.ndarray,
+    plasticity: np.ndarray,
+    voja: np.ndarray,
+    gain: np.ndarray,
+    encoders: np.ndarray,
+    decoders: np.ndarray,
+    activity: np.ndarray,
+    filters: tuple[np.ndarray, ...],
+    values: tuple[np.ndarray, ...],
+    rates: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Decode, learn in place, and filter, in one pass; ``AssociativeMap.forward`` defines it.
 
-    :func:`pes_step` and :func:`voja_step`, of neurons that have been active or fire alone.
+    Its :func:`pes_step` is that of neurons that have been active, :func:`voja_step` of those that
+    fire.
 
     Args:
         spikes: In this step, ``(batch, neurons)``.
@@ -80,8 +81,8 @@ def memorise(  # noqa: ANN202
         activity: Filtered rates in Hz, ``(batch, neurons)``.
         filters: ``rule``, ``recalled``, ``relayed`` and ``taught``, each ``(batch, n_value)``.
         values: What goes into the first, and into the last two; the same shape.
-        rates: Rate of a spike in a step, rates of PES and Voja, and how much is kept of activity and
-            recall, of the rule and what is relayed, and of what is taught.
+        rates: Rate of a spike in a step, rates of PES and Voja, and how much is kept of activity
+            and recall, of the rule and what is relayed, and of what is taught.
 
     Returns:
         ``filters`` after the step.

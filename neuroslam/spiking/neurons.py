@@ -169,7 +169,13 @@ def lif_constants(
 
 
 @compiled
-def fire_row(drive, deficit, asleep, spikes, constants):  # noqa: ANN001, ANN202
+def fire_row(
+    drive: np.ndarray,
+    deficit: np.ndarray,
+    asleep: np.ndarray,
+    spikes: np.ndarray,
+    constants: np.ndarray,
+) -> None:
     """Advance neurons in place, arrays ``(neurons,)``; :func:`lif_step` is the definition.
 
     Choices are between numbers, so that several neurons are advanced at once; all numbers have the
@@ -203,17 +209,17 @@ def fire_row(drive, deficit, asleep, spikes, constants):  # noqa: ANN001, ANN202
 
 
 @compiled
-def respond(  # noqa: ANN202
-    x,  # noqa: ANN001
-    more,  # noqa: ANN001
-    slopes,  # noqa: ANN001
-    rest,  # noqa: ANN001
-    deficit,  # noqa: ANN001
-    asleep,  # noqa: ANN001
-    spikes,  # noqa: ANN001
-    decoders,  # noqa: ANN001
-    constants,  # noqa: ANN001
-):
+def respond(
+    x: np.ndarray,
+    more: np.ndarray,
+    slopes: np.ndarray,
+    rest: np.ndarray,
+    deficit: np.ndarray,
+    asleep: np.ndarray,
+    spikes: np.ndarray,
+    decoders: np.ndarray,
+    constants: np.ndarray,
+) -> np.ndarray:
     """Encode, fire and decode in one pass; only neurons that fire are decoded.
 
     Args:

@@ -328,8 +328,8 @@ class PathIntegrator(Packet):
             walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
         tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
         x, external = oscillators_before(
-            tables.waves, tables.modules, output, recurrent, external, fastest, position, velocity, pull,
-            self.coupling, walk,
+            tables.waves, tables.modules, output, recurrent, external, fastest, position, velocity,
+            pull, self.coupling, walk,
         )  # fmt: skip
         neurons = cast(NeuronArray, self._modules["neurons"])
         decoded = neurons.respond(x, view(self, "decoders"))

@@ -27,11 +27,12 @@ from neuroslam.spiking.vector_steps import (
     Sights,
     VectorState,
     advance,
-    after_recalls,
-    before_recalls,
-    encode_all,
-    fourier_of,
+    after_recall,
+    before_recall,
+    encode,
     times,
+    to_features,
+    to_fourier,
 )
 from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
@@ -307,24 +308,30 @@ class SSPSLAM(BufferModule):
         """Advance some steps as :meth:`_step` does, compiled; results lead with the steps."""
         if self.config.tier == "algebraic":
             return self._compiled_vectors(velocity, sight)
-        numbers = tuple(
+        v, key, vector, held_s = (
             part.contiguous().numpy()
             for part in (velocity, sight.key, torch.view_as_real(sight.vector), sight.held_s)
         )
         seen = (sight.attended != NOTHING).numpy()
-        model, flags = self._gate_constants(view(self, "pull").dtype)
+        model, flags = self._gate_constants(v.dtype)
         found = [
-            self._compiled_step(*(part[k] for part in numbers), seen[k], model, flags)
-            for k in range(len(velocity))
+            self._compiled_step(v[k], key[k], vector[k], held_s[k], seen[k], model, flags)
+            for k in range(len(v))
         ]
         self._count(sight)
-        position, z, says = (
-            torch.from_numpy(np.stack(each)) for each in zip(*found, strict=True)
-        )
+        position, z, says = (torch.from_numpy(np.stack(each)) for each in zip(*found, strict=True))
         return _steps_of(position, z, says, sight.attended)
 
     def _gate_constants(self, kind: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Return the constants of ``vector_steps.before_recall`` and ``after_recall``."""
+        """Return constants of compiled steps, of the type of the state.
+
+        Returns:
+            Time until a landmark is settled, time until the animal is lost, least plasticity,
+            similarity below which a landmark contradicts, time step, gate and its width, gain, gain
+            when lost, similarity above which a landmark agrees. And flags: whether known landmarks
+            are learnt more slowly, whether an animal is never lost, whether neurons are quantised,
+            and room for three more.
+        """
         c, dt = self.config, self.config.time_step_s
         settled = 1.5 * dt if c.tier == "algebraic" else _SETTLED_S
         model = np.array(
@@ -342,9 +349,7 @@ class SSPSLAM(BufferModule):
         kind = view(self, "pull").dtype
         model, flags = self._gate_constants(kind)
         flags[3:] = walk.coupling, walk.look_steps, REREAD_STEPS
-        numbers = np.array(
-            [dt, c.integrator.coupling_gain, walk.share, memory.share], dtype=kind
-        )
+        numbers = np.array([dt, c.integrator.coupling_gain, walk.share, memory.share], dtype=kind)
         inputs = Sights(
             velocity.contiguous().numpy(),
             sight.key.contiguous().numpy(),
@@ -358,7 +363,10 @@ class SSPSLAM(BufferModule):
             view(walk, "position_m").copy(),
             view(memory, "weights").copy(),
             np.zeros((0, 0, 0), kind) if places is None else view(places, "weights").copy(),
-            *(view(self, n).copy() for n in ("recalled", "pull", "familiar", "contradicted_s")),
+            view(self, "recalled").copy(),
+            view(self, "pull").copy(),
+            view(self, "familiar").copy(),
+            view(self, "contradicted_s").copy(),
         )
         position, z, says = advance(
             tuple(walk.decoder.tables()), tuple(inputs), tuple(state), int(walk.age), numbers,
@@ -396,11 +404,13 @@ class SSPSLAM(BufferModule):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Advance neurons one step; return position, coefficients, and what ``SSPStep`` says."""
         walk, memory = cast(PathIntegrator, self.integrator), cast(AssociativeMap, self.map)
-        tables = walk.decoder.tables()
+        tables, each = walk.decoder.tables(), range(self.batch)
         even, odd = tables.even, tables.odd
         z = walk.advance(velocity, view(self, "pull"))
         position = view(walk, "position_m")
-        here = encode_all(tables.waves, position)
+        here, recalled = np.empty_like(z), np.empty_like(z)
+        for b in each:
+            encode(tables.waves, position[b], here[b])
         sees = seen.astype(here.dtype)
         if self.grid is not None:
             here = self.grid.advance(here)
@@ -409,27 +419,32 @@ class SSPSLAM(BufferModule):
             here = self._late_array("here", here, TAU_VECTOR_S)
         bind = self.binding
         place = times(here, vector) if bind is None else bind.advance(here, vector)
-        contradicted = view(self, "contradicted_s").copy()
-        value, now = before_recalls(
-            even, odd, place, view(self, "recalled"), held_s, contradicted, seen, model, flags
-        )
-        recalled = fourier_of(even, odd, memory.advance(key, value, sees, now[:, 4], sees))
+        contradicted, familiar = (view(self, n).copy() for n in ("contradicted_s", "familiar"))
+        value = np.empty((self.batch, even.shape[1]), dtype=here.dtype)
+        now = np.empty((self.batch, 5), dtype=here.dtype)
+        before = view(self, "recalled")
+        for b in each:
+            to_features(even, odd, place[b], value[b])
+            before_recall(before[b], held_s[b], contradicted[b], seen[b], model, flags, now[b])
+        recall = memory.advance(key, value, sees, now[:, 4].copy(), sees)
+        for b in each:
+            to_fourier(even, odd, recall[b], recalled[b])
         if self.places is not None:
-            places, learns = cast(AssociativeMap, self.places), now[:, 3]
-            places.advance(value * sees[:, None], key, sees, np.ascontiguousarray(learns), sees)
+            places = cast(AssociativeMap, self.places)
+            places.advance(value * sees[:, None], key, sees, now[:, 3].copy(), sees)
         back = vector * np.array([1.0, -1.0], dtype=vector.dtype)
         if self.unbinding is None:
             implied = times(recalled, back)
         else:
             implied = self.unbinding.advance(recalled, back)
             here = self._late_array("there", here, TAU_BINDING_S)
-        familiar = view(self, "familiar").copy()
-        said, pull = after_recalls(
-            implied, here, seen, familiar, contradicted, now, model, bool(flags[1])
-        )
-        replace(
-            self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted
-        )
+        pull, said = np.empty_like(here), np.empty((self.batch, 3), dtype=here.dtype)
+        for b in each:
+            after_recall(
+                implied[b], here[b], seen[b], familiar[b : b + 1], contradicted[b : b + 1], now[b],
+                model, bool(flags[1]), said[b], pull[b],
+            )  # fmt: skip
+        replace(self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted)
         return position, z, np.stack([now[:, 0], said[:, 0], said[:, 1], now[:, 1]], axis=-1)
 
     def _late_array(self, name: str, z: np.ndarray, tau_s: float) -> np.ndarray:

@@ -88,14 +88,14 @@ def fourier_tables(n_features: int, dtype: np.dtype) -> tuple[np.ndarray, np.nda
 
 
 @compiled
-def copy(values, into):  # noqa: ANN001, ANN202
+def copy(values: np.ndarray, into: np.ndarray) -> None:
     """Copy an array ``(n,)``: an assignment to a slice takes a second longer to compile."""
     for i in range(len(into)):
         into[i] = values[i]
 
 
 @compiled
-def encode(waves, x, z):  # noqa: ANN001, ANN202
+def encode(waves: np.ndarray, x: np.ndarray, z: np.ndarray) -> None:
     """Encode a position, ``(dimension,)``; ``SSPSpace.encode_fourier`` is the definition."""
     for k in range(waves.shape[0]):
         angle = 0.0
@@ -106,7 +106,7 @@ def encode(waves, x, z):  # noqa: ANN001, ANN202
 
 
 @compiled
-def similarity(waves, z, x):  # noqa: ANN001, ANN202
+def similarity(waves: np.ndarray, z: np.ndarray, x: np.ndarray) -> float:
     """Return the similarity at a position; ``PositionDecoder.similarity`` is the definition."""
     total = 0.0
     for k in range(waves.shape[0]):
@@ -118,7 +118,9 @@ def similarity(waves, z, x):  # noqa: ANN001, ANN202
 
 
 @compiled
-def track(waves, bounds, longest, z, x):  # noqa: ANN001, ANN202
+def track(
+    waves: np.ndarray, bounds: np.ndarray, longest: np.ndarray, z: np.ndarray, x: np.ndarray
+) -> None:
     """Move a position by a step of Newton's method; ``PositionDecoder.track`` is the definition."""
     m = waves.shape[1]
     system = np.zeros((m, m + 1))
@@ -150,7 +152,7 @@ def track(waves, bounds, longest, z, x):  # noqa: ANN001, ANN202
 
 
 @compiled
-def search(space, z, x):  # noqa: ANN001, ANN202
+def search(space: tuple[np.ndarray, ...], z: np.ndarray, x: np.ndarray) -> float:
     """Decode a position over the whole space into ``x``; ``PositionDecoder`` is the definition.
 
     Returns:
@@ -182,7 +184,14 @@ def search(space, z, x):  # noqa: ANN001, ANN202
 
 
 @compiled
-def couple(modules, z, here, coupling, gain, pull):  # noqa: ANN001, ANN202
+def couple(
+    modules: np.ndarray,
+    z: np.ndarray,
+    here: np.ndarray,
+    coupling: int,
+    gain: float,
+    pull: np.ndarray,
+) -> None:
     """Add the coupling of the oscillators to ``pull``; ``path_integrator.coupled`` defines it.
 
     Args:
@@ -213,7 +222,15 @@ def couple(modules, z, here, coupling, gain, pull):  # noqa: ANN001, ANN202
 
 
 @compiled
-def locate(space, z, x, velocity, dt, looks, rereads):  # noqa: ANN001, ANN202
+def locate(
+    space: tuple[np.ndarray, ...],
+    z: np.ndarray,
+    x: np.ndarray,
+    velocity: np.ndarray,
+    dt: float,
+    looks: bool,
+    rereads: bool,
+) -> None:
     """Track a position, in place; ``Packet.locate`` is the definition.
 
     Args:
@@ -237,7 +254,7 @@ def locate(space, z, x, velocity, dt, looks, rereads):  # noqa: ANN001, ANN202
 
 
 @compiled
-def to_features(even, odd, z, features):  # noqa: ANN001, ANN202
+def to_features(even: np.ndarray, odd: np.ndarray, z: np.ndarray, features: np.ndarray) -> None:
     """Turn coefficients into a vector; ``SSPSpace.from_fourier`` is the definition."""
     n = features.shape[0]
     for j in range(n):
@@ -251,7 +268,7 @@ def to_features(even, odd, z, features):  # noqa: ANN001, ANN202
 
 
 @compiled
-def to_fourier(even, odd, features, z):  # noqa: ANN001, ANN202
+def to_fourier(even: np.ndarray, odd: np.ndarray, features: np.ndarray, z: np.ndarray) -> None:
     """Turn a vector into coefficients; ``SSPSpace.to_fourier`` is the definition."""
     n, half = features.shape[0], z.shape[0]
     real, imaginary = np.empty(half, dtype=z.dtype), np.empty(half, dtype=z.dtype)
@@ -268,7 +285,9 @@ def to_fourier(even, odd, features, z):  # noqa: ANN001, ANN202
 
 
 @compiled
-def associate(weights, key, value, rate, recall):  # noqa: ANN001, ANN202
+def associate(
+    weights: np.ndarray, key: np.ndarray, value: np.ndarray, rate: float, recall: np.ndarray
+) -> None:
     """Recall a key's value, and learn in place; ``AlgebraicMap.forward`` is the definition.
 
     Args:
@@ -300,7 +319,7 @@ def associate(weights, key, value, rate, recall):  # noqa: ANN001, ANN202
 
 
 @compiled
-def strength_of(z):  # noqa: ANN001, ANN202
+def strength_of(z: np.ndarray) -> float:
     """Return the root of the mean square of coefficients."""
     total = 0.0
     for k in range(z.shape[0]):
@@ -309,7 +328,15 @@ def strength_of(z):  # noqa: ANN001, ANN202
 
 
 @compiled
-def before_recall(recalled, held, contradicted, seen, model, flags, now):  # noqa: ANN001, ANN202
+def before_recall(
+    recalled: np.ndarray,
+    held: float,
+    contradicted: float,
+    seen: bool,
+    model: np.ndarray,
+    flags: np.ndarray,
+    now: np.ndarray,
+) -> None:
     """Decide how much an animal learns; ``SSPSLAM._step`` is the definition.
 
     Args:
@@ -317,8 +344,8 @@ def before_recall(recalled, held, contradicted, seen, model, flags, now):  # noq
         held: For how long the landmark has been attended to.
         contradicted: For how long known landmarks have contradicted.
         seen: Whether a landmark is in view.
-        model: See ``GateConstants``.
-        flags: See ``GateConstants``.
+        model: See ``SSPSLAM._gate_constants``.
+        flags: See ``SSPSLAM._gate_constants``.
         now: Strength, lost, settled, learns and plasticity, ``(5,)``; written.
     """
     novelty, never, quantised = flags[0], flags[1], flags[2]
@@ -334,7 +361,18 @@ def before_recall(recalled, held, contradicted, seen, model, flags, now):  # noq
 
 
 @compiled
-def after_recall(implied, here, seen, familiar, contradicted, now, model, never, said, pull):  # noqa: ANN001, ANN202
+def after_recall(
+    implied: np.ndarray,
+    here: np.ndarray,
+    seen: bool,
+    familiar: np.ndarray,
+    contradicted: np.ndarray,
+    now: np.ndarray,
+    model: np.ndarray,
+    never: bool,
+    said: np.ndarray,
+    pull: np.ndarray,
+) -> None:
     """Open the gate, and make the correction; ``SSPSLAM._step`` is the definition.
 
     Args:
@@ -344,7 +382,7 @@ def after_recall(implied, here, seen, familiar, contradicted, now, model, never,
         familiar: Of each animal of one, ``(1,)``; changed.
         contradicted: The same.
         now: See :func:`before_recall`.
-        model: See ``GateConstants``.
+        model: See ``SSPSLAM._gate_constants``.
         never: Whether an animal is never lost.
         said: Agreement and gate, ``(2,)``; written.
         pull: ``(n_frequencies, 2)``; written.
@@ -372,7 +410,15 @@ def after_recall(implied, here, seen, familiar, contradicted, now, model, never,
 
 
 @compiled
-def advance(space, inputs, state, age, walk, model, flags):  # noqa: ANN001, ANN202
+def advance(
+    space: tuple[np.ndarray, ...],
+    inputs: tuple[np.ndarray, ...],
+    state: tuple[np.ndarray, ...],
+    age: int,
+    walk: np.ndarray,
+    model: np.ndarray,
+    flags: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Advance SSP-SLAM of the algebraic tier by some steps; ``SSPSLAM._step`` is the definition.
 
     Args:
@@ -382,8 +428,8 @@ def advance(space, inputs, state, age, walk, model, flags):  # noqa: ANN001, ANN
         age: Steps of the path integrator so far.
         walk: Time step, gain of the coupling, share of a correction in a step, share of the error
             that the map learns in one.
-        model: Constants of the gate, see ``SSPSLAM``.
-        flags: Of the gate, then number of the coupling, and steps between two decodings nearby and
+        model: See ``SSPSLAM._gate_constants``.
+        flags: The same; then number of the coupling, and steps between two decodings nearby and
             over the whole space.
 
     Returns:
@@ -457,19 +503,19 @@ def advance(space, inputs, state, age, walk, model, flags):  # noqa: ANN001, ANN
 
 
 @compiled
-def oscillators_before(  # noqa: ANN202
-    waves,  # noqa: ANN001
-    modules,  # noqa: ANN001
-    output,  # noqa: ANN001
-    recurrent,  # noqa: ANN001
-    external,  # noqa: ANN001
-    fastest,  # noqa: ANN001
-    position,  # noqa: ANN001
-    velocity,  # noqa: ANN001
-    pull,  # noqa: ANN001
-    coupling,  # noqa: ANN001
-    walk,  # noqa: ANN001
-):
+def oscillators_before(
+    waves: np.ndarray,
+    modules: np.ndarray,
+    output: np.ndarray,
+    recurrent: np.ndarray,
+    external: np.ndarray,
+    fastest: np.ndarray,
+    position: np.ndarray,
+    velocity: np.ndarray,
+    pull: np.ndarray,
+    coupling: int,
+    walk: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Make the inputs of oscillators; ``PathIntegrator.forward`` and ``drive`` are the definition.
 
     Args:
@@ -514,7 +560,14 @@ def oscillators_before(  # noqa: ANN202
 
 
 @compiled
-def oscillators_after(decoded, recurrent, output, position, velocity, walk):  # noqa: ANN001, ANN202
+def oscillators_after(
+    decoded: np.ndarray,
+    recurrent: np.ndarray,
+    output: np.ndarray,
+    position: np.ndarray,
+    velocity: np.ndarray,
+    walk: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Filter what oscillators say, and move the position; see :func:`oscillators_before`.
 
     Args:
@@ -546,16 +599,7 @@ def oscillators_after(decoded, recurrent, output, position, velocity, walk):  # 
 
 
 @compiled
-def encode_all(waves, x):  # noqa: ANN001, ANN202
-    """Encode positions, ``(batch, dimension)``."""
-    z = np.empty((x.shape[0], waves.shape[0], 2), dtype=x.dtype)
-    for b in range(len(x)):
-        encode(waves, x[b], z[b])
-    return z
-
-
-@compiled
-def times(a, b):  # noqa: ANN001, ANN202
+def times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Multiply coefficients, ``(batch, n_frequencies, 2)``: bind their vectors."""
     product = np.empty_like(a)
     for i in range(a.shape[0]):
@@ -563,47 +607,3 @@ def times(a, b):  # noqa: ANN001, ANN202
             product[i, k, 0] = a[i, k, 0] * b[i, k, 0] - a[i, k, 1] * b[i, k, 1]
             product[i, k, 1] = a[i, k, 0] * b[i, k, 1] + a[i, k, 1] * b[i, k, 0]
     return product
-
-
-@compiled
-def before_recalls(  # noqa: ANN202
-    even, odd, place, recalled, held, contradicted, seen, model, flags  # noqa: ANN001
-):  # fmt: skip
-    """Make the values that a map learns, and how much; see :func:`before_recall`.
-
-    Returns:
-        Vectors of places, ``(batch, n_features)``; what :func:`before_recall` says, ``(batch, 5)``.
-    """
-    batch = len(place)
-    value = np.empty((batch, even.shape[1]), dtype=place.dtype)
-    now = np.empty((batch, 5), dtype=place.dtype)
-    for b in range(batch):
-        to_features(even, odd, place[b], value[b])
-        before_recall(recalled[b], held[b], contradicted[b], seen[b], model, flags, now[b])
-    return value, now
-
-
-@compiled
-def fourier_of(even, odd, features):  # noqa: ANN001, ANN202
-    """Turn vectors, ``(batch, n_features)``, into coefficients."""
-    z = np.empty((len(features), even.shape[0], 2), dtype=features.dtype)
-    for b in range(len(features)):
-        to_fourier(even, odd, features[b], z[b])
-    return z
-
-
-@compiled
-def after_recalls(implied, here, seen, familiar, contradicted, now, model, never):  # noqa: ANN001, ANN202
-    """Open the gates of a batch; see :func:`after_recall`.
-
-    Returns:
-        Agreement, gate and agreement over strength, ``(batch, 3)``; corrections, ``(batch,
-        n_frequencies, 2)``.
-    """
-    said, pull = np.empty((len(here), 3), dtype=here.dtype), np.empty_like(here)
-    for b in range(len(here)):
-        after_recall(
-            implied[b], here[b], seen[b], familiar[b : b + 1], contradicted[b : b + 1], now[b],
-            model, never, said[b], pull[b],
-        )  # fmt: skip
-    return said, pull
