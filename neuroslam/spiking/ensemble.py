@@ -332,8 +332,7 @@ class NeuronArray(BufferModule):
         folded = self._constants()
         deficit = view(self, "deficit")
         groups, batch, n = deficit.shape
-        if more is None:
-            more = np.zeros(batch, dtype=deficit.dtype)
+        added = np.zeros(batch, dtype=deficit.dtype) if more is None else more
         if x.shape != (groups, batch, folded.slopes.shape[1]) or decoders.shape[:2] != (groups, n):
             raise ValueError(
                 f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
@@ -341,7 +340,7 @@ class NeuronArray(BufferModule):
             )
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
         return respond(
-            x, more, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif
+            x, added, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif
         )
 
     def fire_compiled(self, drive: np.ndarray) -> np.ndarray:

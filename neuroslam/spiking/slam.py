@@ -382,7 +382,8 @@ class SSPSLAM(BufferModule):
             contradicted_s=state.contradicted,
         )  # fmt: skip
         self._count(sight)
-        return _steps_of(*(torch.from_numpy(each) for each in (position, z, says)), sight.attended)
+        at, coefficients, said = (torch.from_numpy(each) for each in (position, z, says))
+        return _steps_of(at, coefficients, said, sight.attended)
 
     def _count(self, sight: Sight) -> None:
         """Note the time, and what is attended to, after some steps."""

@@ -23,7 +23,35 @@ Rule = Callable[[Tensor, Tensor, Join], Tensor]
 """Merge of a loaded and a partial tensor of one name."""
 
 
-class BufferModule(nn.Module):
+class QuickModule(nn.Module):
+    """A module whose parts are found as fast as other attributes, after the first time.
+
+    Torch finds a part after two failed searches, for a microsecond, and a frame has fifty of them.
+    Setting another part removes the one that was found.
+    """
+
+    if not TYPE_CHECKING:  # as torch declares it
+
+        def __getattr__(self, name: str) -> Tensor | nn.Module:
+            found = super().__getattr__(name)
+            if isinstance(found, nn.Module):
+                self.__dict__[name] = found
+            return found
+
+    def __setattr__(self, name: str, value: Any) -> None:  # noqa: ANN401
+        """Set an attribute as torch does; a part that is set to ``None`` is not found any more."""
+        if value is None and name in self.__dict__.get("_modules", ()):
+            self.__dict__.pop(name, None)
+        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]
+
+    def __delattr__(self, name: str) -> None:
+        """Delete an attribute, and what was found by its name."""
+        if name in self._modules:
+            self.__dict__.pop(name, None)
+        super().__delattr__(name)
+
+
+class BufferModule(QuickModule):
     """A module whose state is in buffers that are replaced in every step.
 
     Attributes:
