@@ -198,7 +198,7 @@ def made(name):
     return memory
 
 
-@case("spiking.neurons.respond", "spiking.ensemble.filtered")
+@case("spiking.neurons.respond", "spiking.ensemble.filter_into")
 def _a_population_says_what_it_is_tuned_to(draw):
     objects = with_state(made("objects"), draw)
     z = complex_of(draw, 2, objects.decoded.shape[1])

@@ -189,11 +189,13 @@ class AssociativeMap(BufferModule):
         passed = recalled
         if self.config.relay:
             passed = self.relay.respond(passed[None], view(self, "relay_decoders"))[0]
-        rule, recalled, relayed, taught = memorise(
+        after = tuple(np.empty_like(rule) for _ in range(4))
+        memorise(
             spikes, key, plasticity, voja, view(self, "gain"), encoders, view(self, "decoders"),
             view(self, "activity_hz"), (rule, recalled, relayed, taught),
-            (error_now, passed, value), rates,
+            (error_now, passed, value), rates, (*after, np.empty_like(rule[0])),
         )  # fmt: skip
+        rule, recalled, relayed, taught = after
         replace(self, rule=rule, recalled=recalled, relayed=relayed, taught=taught)
         return recalled
 

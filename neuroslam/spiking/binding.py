@@ -108,18 +108,20 @@ class SpikingBinding(BufferModule):
     def advance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
         decoders = view(self, "decoders").reshape(8 * a.shape[1], -1, 1)
-        squares = self.neurons.respond(sums_and_differences(a, b), decoders)
-        kept = synapse(TAU_S, self.time_step_s)
-        product = products_of(squares, view(self, "product"), kept)
+        x = np.empty((len(decoders), len(a), 1), dtype=a.dtype)
+        sums_and_differences(a, b, x)
+        squares = self.neurons.respond(x, decoders)
+        before, kept = view(self, "product"), synapse(TAU_S, self.time_step_s)
+        product = np.empty_like(before)
+        products_of(squares, before, kept, product)
         replace(self, product=product)
         return product
 
 
 @compiled
-def sums_and_differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return what the populations square, ``(8 n_frequencies, batch, 1)``."""
+def sums_and_differences(a: np.ndarray, b: np.ndarray, x: np.ndarray) -> None:
+    """Write what the populations square into ``x``, ``(8 n_frequencies, batch, 1)``."""
     batch, n = a.shape[0], a.shape[1]
-    x = np.empty((8 * n, batch, 1), dtype=a.dtype)
     for i in range(batch):
         for k in range(n):
             for row in range(4):
@@ -127,14 +129,12 @@ def sums_and_differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
                 right = b[i, k, (row + row // 2) % 2] / _RADIUS
                 x[row * n + k, i, 0] = left + right
                 x[(4 + row) * n + k, i, 0] = left - right
-    return x
 
 
 @compiled
-def products_of(squares: np.ndarray, before: np.ndarray, kept: float) -> np.ndarray:
-    """Return the filtered products, of the shape of those before, ``(batch, n_frequencies, 2)``."""
+def products_of(squares: np.ndarray, before: np.ndarray, kept: float, product: np.ndarray) -> None:
+    """Write the filtered products, as those before ``(batch, n_frequencies, 2)``."""
     batch, n = before.shape[0], before.shape[1]
-    product = np.empty_like(before)
     for i in range(batch):
         for k in range(n):
             rr = 0.5 * (squares[k, i, 0] - squares[4 * n + k, i, 0])
@@ -143,4 +143,3 @@ def products_of(squares: np.ndarray, before: np.ndarray, kept: float) -> np.ndar
             ir = 0.5 * (squares[3 * n + k, i, 0] - squares[7 * n + k, i, 0])
             product[i, k, 0] = (rr - ii) + kept * (before[i, k, 0] - (rr - ii))
             product[i, k, 1] = (ri + ir) + kept * (before[i, k, 1] - (ri + ir))
-    return product

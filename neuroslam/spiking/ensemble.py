@@ -191,15 +191,18 @@ def may_share(module: BufferModule, *names: str) -> bool:
     return True
 
 
-@compiled
 def filtered(before: np.ndarray, value: np.ndarray, kept: float) -> np.ndarray:
-    """Filter coefficients, ``(batch, n_frequencies, 2)``; :func:`lowpass` is the definition."""
+    """Filter coefficients, ``(batch, n_frequencies, 2)``, as :func:`lowpass` does."""
     after = np.empty_like(before)
-    for b in range(before.shape[0]):
-        for k in range(before.shape[1]):
-            for i in range(2):
-                after[b, k, i] = value[b, k, i] + kept * (before[b, k, i] - value[b, k, i])
+    filter_into(before.reshape(-1), value.reshape(-1), kept, after.reshape(-1))
     return after
+
+
+@compiled
+def filter_into(before: np.ndarray, value: np.ndarray, kept: float, after: np.ndarray) -> None:
+    """Filter numbers into ``after``; :func:`lowpass` is the definition."""
+    for i in range(before.shape[0]):
+        after[i] = value[i] + kept * (before[i] - value[i])
 
 
 class NeuronArray(BufferModule):
@@ -339,9 +342,12 @@ class NeuronArray(BufferModule):
                 f"(groups, batch, neurons) = {deficit.shape}"
             )
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
-        return respond(
-            x, added, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif
-        )
+        decoded = np.empty((groups, batch, decoders.shape[2]), dtype=deficit.dtype)
+        respond(
+            x, added, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif,
+            decoded,
+        )  # fmt: skip
+        return decoded
 
     def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
         """Step as :meth:`fire` does, in one compiled pass."""

@@ -64,7 +64,8 @@ def memorise(
     filters: tuple[np.ndarray, ...],
     values: tuple[np.ndarray, ...],
     rates: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    after: tuple[np.ndarray, ...],
+) -> None:
     """Decode, learn in place, and filter, in one pass; ``AssociativeMap.forward`` defines it.
 
     Its :func:`pes_step` is that of neurons that have been active, :func:`voja_step` of those that
@@ -83,9 +84,7 @@ def memorise(
         values: What goes into the first, and into the last two; the same shape.
         rates: Rate of a spike in a step, rates of PES and Voja, and how much is kept of activity
             and recall, of the rule and what is relayed, and of what is taught.
-
-    Returns:
-        ``filters`` after the step.
+        after: ``filters`` after the step, and room for one row of them; written.
     """
     batch, neurons, n_value = decoders.shape
     n_key = encoders.shape[2]
@@ -94,15 +93,14 @@ def memorise(
     )  # fmt: skip
     rule, recalled, relayed, taught = filters
     error_now, passed, value = values
-    new_rule, new_recalled = np.empty_like(rule), np.zeros_like(rule)
-    new_relayed, new_taught = np.empty_like(rule), np.empty_like(rule)
-    wrong = np.empty(n_value, dtype=rule.dtype)
+    new_rule, new_recalled, new_relayed, new_taught, wrong = after
     for b in range(batch):
         said, name = new_recalled[b], key[b]
         largest, moves = 0.0, move * voja[b]
         for o in range(n_value):
+            said[o] = 0.0
             wrong[o] = pes * (plasticity[b] * rule[b, o])
-            largest = max(largest, abs(wrong[o]))
+            largest = abs(wrong[o]) if abs(wrong[o]) > largest else largest
         for i in range(neurons):
             spike, row = spikes[b, i], decoders[b, i]
             rate = spike * per_spike
@@ -125,4 +123,3 @@ def memorise(
             new_rule[b, o] = error_now[b, o] + errs * (rule[b, o] - error_now[b, o])
             new_relayed[b, o] = passed[b, o] + errs * (relayed[b, o] - passed[b, o])
             new_taught[b, o] = value[b, o] + teaches * (taught[b, o] - value[b, o])
-    return new_rule, new_recalled, new_relayed, new_taught

@@ -219,7 +219,8 @@ def respond(
     spikes: np.ndarray,
     decoders: np.ndarray,
     constants: np.ndarray,
-) -> np.ndarray:
+    decoded: np.ndarray,
+) -> None:
     """Encode, fire and decode in one pass; only neurons that fire are decoded.
 
     Args:
@@ -232,13 +233,10 @@ def respond(
         spikes: The same; written alone.
         decoders: ``(groups, neurons, outputs)``.
         constants: See :func:`lif_constants`.
-
-    Returns:
-        What is decoded, ``(groups, batch, outputs)``.
+        decoded: What the spikes say, ``(groups, batch, outputs)``; written.
     """
     groups, batch, n = deficit.shape
     outputs = decoders.shape[2]
-    decoded = np.zeros((groups, batch, outputs), dtype=deficit.dtype)
     block = max(1, _IN_CACHE // n)  # rows that are advanced together
     drive = np.empty(block * n, dtype=deficit.dtype)
     who = np.empty(n + 1, dtype=np.int64)
@@ -259,6 +257,8 @@ def respond(
         for r in range(first, last):
             g, b, m = r // batch, r % batch, 0
             own, into = fired[r * n : (r + 1) * n], decoded[g, b]
+            for o in range(outputs):
+                into[o] = 0.0
             for i in range(n):
                 who[m] = i
                 m += 1 if own[i] != 0.0 else 0
@@ -276,4 +276,3 @@ def respond(
                     row = decoders[g, who[k]]
                     for o in range(outputs):
                         into[o] += row[o]
-    return decoded

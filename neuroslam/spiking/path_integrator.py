@@ -25,6 +25,7 @@ from neuroslam.spiking.space import SSPSpace
 from neuroslam.spiking.vector_steps import (
     CLEARLY_BETTER,
     COUPLINGS,
+    couple,
     oscillators_after,
     oscillators_before,
     search,
@@ -177,6 +178,31 @@ class Packet(BufferModule, ABC):
         self.position_m, self.age = position, self.age + 1
         return z
 
+    def locate_compiled(self, z: np.ndarray, position: np.ndarray) -> None:
+        """Count a step, and track positions in place as :meth:`locate` does.
+
+        Args:
+            z: ``(batch, n_frequencies, 2)``.
+            position: Integrated, ``(batch, dimension)``.
+        """
+        age = int(view(self, "age")) + 1
+        replace(self, age=np.array(age))
+        if age % self.look_steps == 0:
+            tables = self.decoder.tables()
+            for mine, x in zip(z, position, strict=True):
+                track(tables.waves, tables.bounds, tables.longest, mine, x)
+        if age % REREAD_STEPS == 0:
+            self.reread(z, position)
+
+    def reread(self, z: np.ndarray, position: np.ndarray) -> None:
+        """Decode positions over the whole space, in place; a jump must be clearly better."""
+        tables = self.decoder.tables()
+        for mine, x in zip(z, position, strict=True):
+            found = np.empty_like(x)
+            best = search(tuple(tables), mine, found)
+            if best > similarity(tables.waves, mine, x) + CLEARLY_BETTER:
+                x[:] = found
+
 
 class PathIntegrator(Packet):
     """Represents a position by phases of oscillators whose frequency the velocity sets.
@@ -327,29 +353,26 @@ class PathIntegrator(Packet):
             kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
             walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
         tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
-        x, external = oscillators_before(
-            tables.waves, tables.modules, output, recurrent, external, fastest, position, velocity,
-            pull, self.coupling, walk,
+        n, batch, _ = output.shape
+        x = np.empty((n, batch, 3), dtype=output.dtype)
+        z = np.empty((batch, n, 2), dtype=output.dtype)
+        later, again, read = (np.empty_like(output) for _ in range(3))
+        if self.coupling == COUPLINGS.index("modules"):
+            pull = pull.copy()
+            for b, inner in enumerate(pull):
+                held = np.ascontiguousarray(output[:, b])
+                couple(tables.modules, held, held, self.coupling, walk[0], inner)
+        manifold = self.coupling == COUPLINGS.index("manifold")
+        oscillators_before(
+            tables.waves, output, recurrent, external, fastest, position, velocity, pull, manifold,
+            walk, x, later,
         )  # fmt: skip
         neurons = cast(NeuronArray, self._modules["neurons"])
         decoded = neurons.respond(x, view(self, "decoders"))
-        recurrent, output, z, position = oscillators_after(
-            decoded, recurrent, output, position, velocity, walk
-        )
-        age = int(view(self, "age")) + 1
-        if age % self.look_steps == 0:
-            for mine, x in zip(z, position, strict=True):
-                track(tables.waves, tables.bounds, tables.longest, mine, x)
-        if age % REREAD_STEPS == 0:
-            for mine, x in zip(z, position, strict=True):
-                found = np.empty_like(x)
-                best = search(tuple(tables), mine, found)
-                if best > similarity(tables.waves, mine, x) + CLEARLY_BETTER:
-                    x[:] = found
-        replace(
-            self, external=external, recurrent=recurrent, output=output, position_m=position,
-            age=np.array(age),
-        )  # fmt: skip
+        oscillators_after(decoded, recurrent, output, walk, again, read, z)
+        position = position + walk[4] * velocity
+        self.locate_compiled(z, position)
+        replace(self, external=later, recurrent=again, output=read, position_m=position)
         return z
 
     def drive(self, share: Tensor, pull: Tensor | None) -> None:

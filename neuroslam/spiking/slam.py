@@ -24,6 +24,7 @@ from neuroslam.spiking.quantise import on_chip, quantised
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.spiking.vector_steps import (
     KNOWN,
+    Scratch,
     Sights,
     VectorState,
     advance,
@@ -330,7 +331,7 @@ class SSPSLAM(BufferModule):
             similarity below which a landmark contradicts, time step, gate and its width, gain, gain
             when lost, similarity above which a landmark agrees. And flags: whether known landmarks
             are learnt more slowly, whether an animal is never lost, whether neurons are quantised,
-            and room for three more.
+            and room for four more.
         """
         c, dt = self.config, self.config.time_step_s
         settled = 1.5 * dt if c.tier == "algebraic" else _SETTLED_S
@@ -339,7 +340,7 @@ class SSPSLAM(BufferModule):
              float(self.gate), _GATE_WIDTH, float(self.gain), _LOST_GAIN, _AGREES], dtype=kind,
         )  # fmt: skip
         novelty, never = c.map.plasticity == "novelty", c.relocalise_after_s == 0
-        return model, np.array([novelty, never, c.quantised, 0, 0, 0])
+        return model, np.array([novelty, never, c.quantised, 0, 0, 0, 0])
 
     def _compiled_vectors(self, velocity: Tensor, sight: Sight) -> SSPStep:
         """Advance vectors some steps, in one compiled call."""
@@ -348,7 +349,6 @@ class SSPSLAM(BufferModule):
         places = cast(AlgebraicMap | None, self.places)
         kind = view(self, "pull").dtype
         model, flags = self._gate_constants(kind)
-        flags[3:] = walk.coupling, walk.look_steps, REREAD_STEPS
         numbers = np.array([dt, c.integrator.coupling_gain, walk.share, memory.share], dtype=kind)
         inputs = Sights(
             velocity.contiguous().numpy(),
@@ -368,10 +368,28 @@ class SSPSLAM(BufferModule):
             view(self, "familiar").copy(),
             view(self, "contradicted_s").copy(),
         )
-        position, z, says = advance(
-            tuple(walk.decoder.tables()), tuple(inputs), tuple(state), int(walk.age), numbers,
-            model, flags,
-        )  # fmt: skip
+        found = Scratch.of(inputs, self.space.n_features)
+        begin, age = 0, int(walk.age)
+        while begin < len(velocity):
+            end = min(len(velocity), begin + REREAD_STEPS - (age + begin) % REREAD_STEPS)
+            rereads = (age + end) % REREAD_STEPS == 0
+            parts = [(begin, end - rereads, 0)]
+            if rereads:
+                parts += [(end - 1, end, 1), (end - 1, end, 2)]
+            for first, last, half in parts:
+                if half == 2:
+                    walk.reread(state.phasor, state.position)
+                flags[3:] = walk.coupling, age + first, walk.look_steps, half
+                advance(
+                    tuple(walk.decoder.tables()),
+                    tuple(part[first:last] for part in inputs),
+                    tuple(state),
+                    (*(part[first:last] for part in found[:3]), *found.room),
+                    numbers,
+                    model,
+                    flags,
+                )
+            begin = end
         replace(walk, phasor=state.phasor, position_m=state.position)
         walk.age = walk.age + len(velocity)
         replace(memory, weights=state.weights)
@@ -382,7 +400,7 @@ class SSPSLAM(BufferModule):
             contradicted_s=state.contradicted,
         )  # fmt: skip
         self._count(sight)
-        at, coefficients, said = (torch.from_numpy(each) for each in (position, z, says))
+        at, coefficients, said = (torch.from_numpy(each) for each in found[:3])
         return _steps_of(at, coefficients, said, sight.attended)
 
     def _count(self, sight: Sight) -> None:
@@ -419,7 +437,7 @@ class SSPSLAM(BufferModule):
             vector = self.vectors.advance(vector) * sees[:, None, None]
             here = self._late_array("here", here, TAU_VECTOR_S)
         bind = self.binding
-        place = times(here, vector) if bind is None else bind.advance(here, vector)
+        place = _product(here, vector) if bind is None else bind.advance(here, vector)
         contradicted, familiar = (view(self, n).copy() for n in ("contradicted_s", "familiar"))
         value = np.empty((self.batch, even.shape[1]), dtype=here.dtype)
         now = np.empty((self.batch, 5), dtype=here.dtype)
@@ -435,7 +453,7 @@ class SSPSLAM(BufferModule):
             places.advance(value * sees[:, None], key, sees, now[:, 3].copy(), sees)
         back = vector * np.array([1.0, -1.0], dtype=vector.dtype)
         if self.unbinding is None:
-            implied = times(recalled, back)
+            implied = _product(recalled, back)
         else:
             implied = self.unbinding.advance(recalled, back)
             here = self._late_array("there", here, TAU_BINDING_S)
@@ -628,6 +646,12 @@ def _steps_of(position: Tensor, z: Tensor, says: Tensor, attended: Tensor) -> SS
     return SSPStep(
         position, torch.view_as_complex(z), strength, agreement, gate, lost != 0, attended
     )
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    product = np.empty_like(a)
+    times(a, b, product)
+    return product
 
 
 def _checked_names(names: Sequence[str], n: int) -> tuple[str, ...]:

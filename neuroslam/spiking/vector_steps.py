@@ -80,6 +80,34 @@ class VectorState(NamedTuple):
     contradicted: np.ndarray
 
 
+class Scratch(NamedTuple):
+    """Results of steps of the algebraic tier, and room for what they compute.
+
+    Attributes:
+        position: Results, ``(steps, batch, dimension)``.
+        z: Coefficients, ``(steps, batch, n_frequencies, 2)``.
+        says: Strength, agreement, gate and lost, ``(steps, batch, 4)``.
+        room: For one animal: three times coefficients, two vectors, a key, and numbers.
+    """
+
+    position: np.ndarray
+    z: np.ndarray
+    says: np.ndarray
+    room: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, inputs: Sights, n_features: int) -> "Scratch":
+        """Make room for some steps."""
+        (steps, batch, m), n, kind = inputs.velocity.shape, n_features // 2, inputs.velocity.dtype
+        shapes = [(n, 2)] * 3 + [(n_features,)] * 2 + [inputs.key.shape[2:], (5,), (3,)]
+        return cls(
+            np.empty((steps, batch, m), dtype=kind),
+            np.empty((steps, batch, n, 2), dtype=kind),
+            np.empty((steps, batch, 4), dtype=kind),
+            tuple(np.zeros(shape, dtype=kind) for shape in shapes),
+        )
+
+
 def fourier_tables(n_features: int, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """Return the cosines and sines of the Fourier transform of vectors, without the constant."""
     k, j = np.arange(1, n_features // 2 + 1), np.arange(n_features)
@@ -123,14 +151,17 @@ def track(
 ) -> None:
     """Move a position by a step of Newton's method; ``PositionDecoder.track`` is the definition."""
     m = waves.shape[1]
-    system = np.zeros((m, m + 1))
+    system = np.empty((m, m + 1), dtype=np.float64)
+    for d in range(m):
+        for e in range(m + 1):
+            system[d, e] = 0.0
     for k in range(waves.shape[0]):
         angle = 0.0
         for d in range(m):
             angle += waves[k, d] * x[d]
         c, s = math.cos(angle), math.sin(angle)
         here, ahead = z[k, 0] * c + z[k, 1] * s, z[k, 1] * c - z[k, 0] * s
-        here = max(here, LEAST_CURVATURE)
+        here = here if here > LEAST_CURVATURE else LEAST_CURVATURE
         for d in range(m):
             for e in range(m):
                 system[d, e] += here * waves[k, d] * waves[k, e]
@@ -147,8 +178,11 @@ def track(
         step /= system[d, d]
         system[d, m] = step
     for d in range(m):
-        step = min(max(system[d, m], -longest[d]), longest[d])
-        x[d] = min(max(x[d] + step, bounds[d, 0]), bounds[d, 1])
+        step, low, high = system[d, m], bounds[d, 0], bounds[d, 1]
+        step = -longest[d] if step < -longest[d] else step
+        at = x[d] + (longest[d] if step > longest[d] else step)
+        at = low if at < low else at
+        x[d] = high if at > high else at
 
 
 @compiled
@@ -161,12 +195,14 @@ def search(space: tuple[np.ndarray, ...], z: np.ndarray, x: np.ndarray) -> float
     waves, bounds, longest, points, cosines, sines = (
         space[0], space[1], space[2], space[4], space[5], space[6],
     )  # fmt: skip
-    coarse = np.zeros(points.shape[0], dtype=z.dtype)
+    coarse = np.empty(points.shape[0], dtype=z.dtype)
+    for p in range(points.shape[0]):
+        coarse[p] = 0.0
     for k in range(waves.shape[0]):
         real, imaginary, c, s = z[k, 0], z[k, 1], cosines[k], sines[k]
         for p in range(points.shape[0]):
             coarse[p] += real * c[p] + imaginary * s[p]
-    best, at = -np.inf, np.empty_like(x)
+    best, at = -np.inf, np.empty(x.shape[0], dtype=z.dtype)
     for _ in range(min(CANDIDATES, points.shape[0])):
         top = 0
         for p in range(points.shape[0]):
@@ -208,49 +244,17 @@ def couple(
             pull[k, 1] += gain * (here[k, 1] - z[k, 1])
     elif coupling == 1:
         for i in range(modules.shape[0]):
-            product = complex(1.0, 0.0)
+            even, odd = 1.0, 0.0
             for j in range(modules.shape[1]):
-                k = modules[i, j]
-                product *= complex(z[k, 0], z[k, 1])
-            turn = -math.atan2(product.imag, product.real) / modules.shape[1]
+                c, s = z[modules[i, j], 0], z[modules[i, j], 1]
+                even, odd = even * c - odd * s, even * s + odd * c
+            turn = -math.atan2(odd, even) / modules.shape[1]
             c, s = math.cos(turn), math.sin(turn)
             for j in range(modules.shape[1]):
                 k = modules[i, j]
                 real, imaginary = z[k, 0], z[k, 1]
                 pull[k, 0] += gain * (c * real - s * imaginary - real)
                 pull[k, 1] += gain * (s * real + c * imaginary - imaginary)
-
-
-@compiled
-def locate(
-    space: tuple[np.ndarray, ...],
-    z: np.ndarray,
-    x: np.ndarray,
-    velocity: np.ndarray,
-    dt: float,
-    looks: bool,
-    rereads: bool,
-) -> None:
-    """Track a position, in place; ``Packet.locate`` is the definition.
-
-    Args:
-        space: Its tables.
-        z: Coefficients, ``(n_frequencies, 2)``.
-        x: Position, ``(dimension,)``.
-        velocity: ``(dimension,)``.
-        dt: Length of a step.
-        looks: Whether it is decoded nearby.
-        rereads: Whether it is decoded over the whole space.
-    """
-    for d in range(x.shape[0]):
-        x[d] += dt * velocity[d]
-    if looks:
-        track(space[0], space[1], space[2], z, x)
-    if rereads:
-        found = np.empty_like(x)
-        best = search(space, z, found)
-        if best > similarity(space[0], z, x) + CLEARLY_BETTER:
-            copy(found, x)
 
 
 @compiled
@@ -300,7 +304,7 @@ def associate(
     square, n, change = 0.0, key.shape[0], np.empty(1, dtype=weights.dtype)
     for j in range(n):
         square += key[j] * key[j]
-    square = max(square, 1e-6)
+    square = square if square > 1e-6 else 1e-6
     for i in range(weights.shape[0]):
         row = weights[i]
         one = two = three = four = 0.0
@@ -357,7 +361,8 @@ def before_recall(
         learns = seen
     now[1], now[2], now[3], now[4] = lost, settled, learns, learns
     if novelty and learns:
-        now[4] = min(max(1.0 - now[0] * now[0], model[2]), 1.0)
+        share = 1.0 - now[0] * now[0]
+        now[4] = share if share > model[2] else model[2]
 
 
 @compiled
@@ -397,13 +402,14 @@ def after_recall(
     known = familiar[0] and settled and seen
     said[1] = 1.0 / (1.0 + math.exp((model[5] - said[0]) / model[6])) if known else 0.0
     if known:
-        said[2] = said[0] / max(strength, KNOWN)
+        said[2] = said[0] / (strength if strength > KNOWN else KNOWN)
         if said[2] < model[3]:
             contradicted[0] += model[4]
         if said[2] > model[9]:
             contradicted[0] = 0.0
     gain = model[8] if lost and known else model[7] * said[1]
-    size = max(strength_of(implied), 1e-3)
+    size = strength_of(implied)
+    size = size if size > 1e-3 else 1e-3
     for k in range(here.shape[0]):
         pull[k, 0] = gain * (implied[k, 0] / size - here[k, 0])
         pull[k, 1] = gain * (implied[k, 1] / size - here[k, 1])
@@ -414,49 +420,40 @@ def advance(
     space: tuple[np.ndarray, ...],
     inputs: tuple[np.ndarray, ...],
     state: tuple[np.ndarray, ...],
-    age: int,
+    scratch: tuple[np.ndarray, ...],
     walk: np.ndarray,
     model: np.ndarray,
     flags: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> None:
     """Advance SSP-SLAM of the algebraic tier by some steps; ``SSPSLAM._step`` is the definition.
 
     Args:
         space: ``SpaceTables`` as a tuple.
         inputs: ``Sights`` as a tuple.
         state: ``VectorState`` as a tuple; advanced in place.
-        age: Steps of the path integrator so far.
+        scratch: ``Scratch`` as a tuple; written.
         walk: Time step, gain of the coupling, share of a correction in a step, share of the error
             that the map learns in one.
         model: See ``SSPSLAM._gate_constants``.
-        flags: The same; then number of the coupling, and steps between two decodings nearby and
-            over the whole space.
-
-    Returns:
-        Position, coefficients, and strength, agreement, gate and lost of each step.
+        flags: The same; then number of the coupling, steps of the path integrator so far, steps
+            between two decodings of the position, and which half of a step is made: 0 both, 1 path
+            integration, 2 the map.
     """
     velocity, key, vector, seen, held, noise = inputs
     phasor, position, weights, places, recalled, pull, familiar, contradicted = state
+    positions, zs, says, here, place, implied, value, recall, named, now, said = scratch
     waves, even, odd = space[0], space[7], space[8]
     steps, batch, m = velocity.shape
-    n, n_features = waves.shape[0], even.shape[1]
-    kind = position.dtype
-    positions = np.empty((steps, batch, m), dtype=kind)
-    zs = np.empty((steps, batch, n, 2), dtype=kind)
-    says = np.zeros((steps, batch, 4), dtype=kind)  # strength, agreement, gate, lost
-    here, place = np.empty((n, 2), dtype=kind), np.empty((n, 2), dtype=kind)
-    implied = np.empty((n, 2), dtype=kind)
-    value, recall = np.empty(n_features, dtype=kind), np.empty(n_features, dtype=kind)
-    named = np.empty(places.shape[1], dtype=kind)
-    now, said = np.zeros(5, dtype=kind), np.zeros(3, dtype=kind)
+    n = waves.shape[0]
     dt, coupling, corrected, learnt = walk[0], walk[1], walk[2], walk[3]
     for b in range(batch):
         x, z = position[b], phasor[b]
         encode(waves, x, here)
         for t in range(steps):
             sees, v = seen[t, b], velocity[t, b]
-            couple(space[3], z, here, flags[3], coupling, pull[b])
-            for k in range(n):
+            if flags[6] != 2:
+                couple(space[3], z, here, flags[3], coupling, pull[b])
+            for k in range(n if flags[6] != 2 else 0):
                 real = z[k, 0] + corrected * pull[b, k, 0]
                 imaginary = z[k, 1] + corrected * pull[b, k, 1]
                 turn = 0.0
@@ -464,12 +461,18 @@ def advance(
                     turn += waves[k, d] * (v[d] * dt)
                 if noise.shape[0] > 0:
                     turn += noise[t, b, k]
-                size = max(math.sqrt(real * real + imaginary * imaginary), 1e-6)
+                size = math.sqrt(real * real + imaginary * imaginary)
+                size = size if size > 1e-6 else 1e-6
                 c, s = math.cos(turn) / size, math.sin(turn) / size
                 z[k, 0], z[k, 1] = c * real - s * imaginary, c * imaginary + s * real
-            passed = age + t + 1
-            locate(space, z, x, v, dt, passed % flags[4] == 0, passed % flags[5] == 0)
-            encode(waves, x, here)
+            if flags[6] != 2:
+                for d in range(m):
+                    x[d] += dt * v[d]
+                if (flags[4] + t + 1) % flags[5] == 0:
+                    track(waves, space[1], space[2], z, x)
+                encode(waves, x, here)
+            if flags[6] == 1:
+                continue
             before_recall(recalled[b], held[t, b], contradicted[b], sees, model, flags, now)
             if sees:
                 for k in range(n):
@@ -499,13 +502,11 @@ def advance(
             says[t, b, 0], says[t, b, 1], says[t, b, 2], says[t, b, 3] = (
                 now[0], said[0], said[1], now[1],
             )  # fmt: skip
-    return positions, zs, says
 
 
 @compiled
 def oscillators_before(
     waves: np.ndarray,
-    modules: np.ndarray,
     output: np.ndarray,
     recurrent: np.ndarray,
     external: np.ndarray,
@@ -513,14 +514,15 @@ def oscillators_before(
     position: np.ndarray,
     velocity: np.ndarray,
     pull: np.ndarray,
-    coupling: int,
+    manifold: bool,
     walk: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    x: np.ndarray,
+    later: np.ndarray,
+) -> None:
     """Make the inputs of oscillators; ``PathIntegrator.forward`` and ``drive`` are the definition.
 
     Args:
         waves: Wave vectors.
-        modules: Frequencies of each module.
         output: ``(n_frequencies, batch, 2)``.
         recurrent: The same shape.
         external: The same.
@@ -528,35 +530,29 @@ def oscillators_before(
         position: ``(batch, dimension)``.
         velocity: The same shape.
         pull: Correction, ``(batch, n_frequencies, 2)``.
-        coupling: Number in ``COUPLINGS``.
+        manifold: Whether all oscillators agree on one position; for the other coupling see
+            :func:`couple`.
         walk: Gain of the coupling, share that is kept of ``external``, of ``recurrent`` and of
             ``output``, time step.
-
-    Returns:
-        The inputs, ``(n_frequencies, batch, 3)``, and ``external`` after the step.
+        x: The inputs, ``(n_frequencies, batch, 3)``; written.
+        later: ``external`` after the step; written.
     """
-    n, batch = output.shape[0], output.shape[1]
-    x = np.empty((n, batch, 3), dtype=output.dtype)
-    later = np.empty_like(external)
-    z, here = np.empty((n, 2), dtype=output.dtype), np.empty((n, 2), dtype=output.dtype)
-    inner = np.empty((n, 2), dtype=output.dtype)
-    for b in range(batch):
-        for k in range(n):
-            inner[k, 0], inner[k, 1] = pull[b, k, 0], pull[b, k, 1]
-            z[k, 0], z[k, 1] = output[k, b, 0], output[k, b, 1]
-        if coupling > 0:
-            encode(waves, position[b], here)
-            couple(modules, z, here, coupling, walk[0], inner)
-        for k in range(n):
-            share = 0.0
+    for b in range(output.shape[1]):
+        for k in range(output.shape[0]):
+            angle = share = 0.0
             for d in range(waves.shape[1]):
+                angle += waves[k, d] * position[b, d]
                 share += velocity[b, d] * (waves[k, d] / fastest[k])
+            even, odd = pull[b, k, 0], pull[b, k, 1]
+            if manifold:
+                even += walk[0] * (math.cos(angle) - output[k, b, 0])
+                odd += walk[0] * (math.sin(angle) - output[k, b, 1])
             x[k, b, 0] = recurrent[k, b, 0] + external[k, b, 0]
             x[k, b, 1] = recurrent[k, b, 1] + external[k, b, 1]
-            x[k, b, 2] = min(max(share, -1.0), 1.0)
-            for i in range(2):
-                later[k, b, i] = inner[k, i] + walk[1] * (external[k, b, i] - inner[k, i])
-    return x, later
+            share = -1.0 if share < -1.0 else share
+            x[k, b, 2] = 1.0 if share > 1.0 else share
+            later[k, b, 0] = even + walk[1] * (external[k, b, 0] - even)
+            later[k, b, 1] = odd + walk[1] * (external[k, b, 1] - odd)
 
 
 @compiled
@@ -564,46 +560,35 @@ def oscillators_after(
     decoded: np.ndarray,
     recurrent: np.ndarray,
     output: np.ndarray,
-    position: np.ndarray,
-    velocity: np.ndarray,
     walk: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Filter what oscillators say, and move the position; see :func:`oscillators_before`.
+    again: np.ndarray,
+    read: np.ndarray,
+    z: np.ndarray,
+) -> None:
+    """Filter what oscillators say; see :func:`oscillators_before`.
 
     Args:
         decoded: ``(n_frequencies, batch, 4)``.
         recurrent: See :func:`oscillators_before`.
         output: The same.
-        position: The same.
-        velocity: The same.
         walk: The same.
-
-    Returns:
-        ``recurrent``, ``output``, coefficients ``(batch, n_frequencies, 2)`` and ``position`` after
-        the step.
+        again: ``recurrent`` after the step; written.
+        read: ``output`` after the step; written.
+        z: The same, ``(batch, n_frequencies, 2)``; written.
     """
-    n, batch = output.shape[0], output.shape[1]
-    again, read = np.empty_like(recurrent), np.empty_like(output)
-    z, x = np.empty((batch, n, 2), dtype=output.dtype), np.empty_like(position)
-    for k in range(n):
-        for b in range(batch):
+    for k in range(output.shape[0]):
+        for b in range(output.shape[1]):
             for i in range(2):
                 value = decoded[k, b, i]
                 again[k, b, i] = value + walk[2] * (recurrent[k, b, i] - value)
                 value = decoded[k, b, 2 + i]
                 read[k, b, i] = z[b, k, i] = value + walk[3] * (output[k, b, i] - value)
-    for b in range(batch):
-        for d in range(position.shape[1]):
-            x[b, d] = position[b, d] + walk[4] * velocity[b, d]
-    return again, read, z, x
 
 
 @compiled
-def times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Multiply coefficients, ``(batch, n_frequencies, 2)``: bind their vectors."""
-    product = np.empty_like(a)
+def times(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> None:
+    """Multiply coefficients, ``(batch, n_frequencies, 2)``, into a third array: bind vectors."""
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
             product[i, k, 0] = a[i, k, 0] * b[i, k, 0] - a[i, k, 1] * b[i, k, 1]
             product[i, k, 1] = a[i, k, 0] * b[i, k, 1] + a[i, k, 1] * b[i, k, 0]
-    return product
