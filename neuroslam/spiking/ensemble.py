@@ -299,7 +299,7 @@ class NeuronArray(BufferModule):
             Spikes in this step, 0 or 1; of rates, how many are to be expected. Same shape.
         """
         model = self.config.model
-        if model in ("lif_rate", "relu"):
+        if self._has_rates:
             return rates(1.0 - drive / self.charged, self.config) * self.time_step_s
         if self.runs_compiled(drive):
             return torch.from_numpy(self.fire_compiled(drive.contiguous().numpy()).copy())
@@ -310,10 +310,12 @@ class NeuronArray(BufferModule):
         self.spikes = fired
         return fired
 
+    @property
+    def _has_rates(self) -> bool:
+        return self.config.model in ("lif_rate", "relu")
+
     def runs_compiled(self, *tensors: Tensor) -> bool:
         """Return whether a compiled step may advance the neurons and take these tensors."""
-        if self.config.model not in ("lif", "stepped_lif"):
-            return False
         weights = cast(Tensor, self._buffers["weights"])
         return runs_compiled(weights, *tensors) and may_share(self, "deficit", "asleep")
 
@@ -322,7 +324,8 @@ class NeuronArray(BufferModule):
     ) -> np.ndarray:
         """Step with vectors as input, and decode, in one compiled pass.
 
-        The spikes of :meth:`forward` times the decoders.
+        The spikes of :meth:`forward` times the decoders. Rates are left to torch: all neurons have
+        one, so nothing is gained where few fire, and its logarithm is vectorised.
 
         Args:
             x: ``(groups, batch, dimensions)``.
@@ -341,6 +344,11 @@ class NeuronArray(BufferModule):
                 f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
                 f"(groups, batch, neurons) = {deficit.shape}"
             )
+        if self._has_rates:
+            more_t = torch.from_numpy(added).unsqueeze(-1)
+            drive = torch.from_numpy(folded.rest).unsqueeze(1) + more_t
+            drive = torch.baddbmm(drive, torch.from_numpy(x), torch.from_numpy(folded.slopes))
+            return torch.bmm(self.fire(drive), torch.from_numpy(decoders)).numpy()
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
         decoded = np.empty((groups, batch, decoders.shape[2]), dtype=deficit.dtype)
         respond(
@@ -354,6 +362,8 @@ class NeuronArray(BufferModule):
         deficit = view(self, "deficit")
         if drive.shape != deficit.shape:
             raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
+        if self._has_rates:
+            return self.fire(torch.from_numpy(drive)).numpy()
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
         rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
         now, owing, paused, fired = rows
