@@ -1,6 +1,7 @@
 """SSP-SLAM: neurons beside the same network in Nengo, vectors, and questions to a map."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -64,7 +65,9 @@ class Animals:
         self.now = (self.now + n) % (len(self.at) - n)
 
 
-def milliseconds(pairs: dict[str, object], steps: int = 200, rounds: int = 7) -> dict[str, float]:
+def milliseconds(
+    pairs: dict[str, Callable[[int], object]], steps: int = 200, rounds: int = 7
+) -> dict[str, float]:
     """Median CPU ms of a step, all in turn in each round: what is noisy is so for all."""
     times: dict[str, list[float]] = {name: [] for name in pairs}
     for run in pairs.values():

@@ -274,6 +274,27 @@ class NeuronArray(BufferModule):
         """Return the rates under constant input, Hz; ``(groups, points, neurons)``."""
         return rates(self.currents(x), self.config, self.time_step_s)
 
+    def solve(self, points: Tensor, targets: Tensor, noise: float = 0.1) -> Tensor:
+        """Solve for decoders of a function, see :func:`solve_decoders`.
+
+        One group after the other: the rates of all groups at all points fill no cache.
+
+        Args:
+            points: ``(groups, n, dimensions)``.
+            targets: The function there, ``(groups, n, outputs)``.
+            noise: As a share of the highest rate.
+
+        Returns:
+            ``(groups, neurons, outputs)``.
+        """
+        solved = []
+        for g in range(len(points)):
+            own = slice(g, g + 1)
+            current = torch.baddbmm(self.bias[own, None], points[own], self.weights[own].mT)
+            activity = rates(current, self.config, self.time_step_s)
+            solved.append(solve_decoders(activity, targets[own], noise))
+        return torch.cat(solved)
+
     def forward(self, x: Tensor) -> Tensor:
         """Step with vectors as input, ``(groups, batch, dimensions)``."""
         share = self.charged
