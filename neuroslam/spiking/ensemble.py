@@ -184,9 +184,9 @@ def may_share(module: BufferModule, *names: str) -> bool:
     """Return whether compiled steps may take these buffers; quick for those that they have set."""
     views = module.__dict__.get("_views") or {}
     for name in names:
-        buffer = module._buffers[name]
-        known = views.get(name)
-        if (known is None or known[0] is not buffer) and not runs_compiled(cast(Tensor, buffer)):
+        buffer, known = cast(Tensor, module._buffers[name]), views.get(name)
+        shared = known is not None and known[0] is buffer and not buffer.requires_grad
+        if not shared and not runs_compiled(buffer):
             return False
     return True
 
