@@ -32,8 +32,10 @@ from neuroslam.config.semantic import (
 )
 from neuroslam.mapping.actions import nearest_bound, nearest_bound_of_arrays
 from neuroslam.mapping.relax import Relaxation
+from neuroslam.spiking import vector_steps
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.binding import SpikingBinding
+from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.slam import SSPSLAM
@@ -236,6 +238,22 @@ def _a_position_is_integrated_by_neurons(draw):
         pull = None if draw.random() < 0.3 else complex_of(draw, 2, 6)
         pairs += by_both(walk, lambda w, pull=pull: [torch.view_as_real(w(velocity, pull))])
     return pairs
+
+
+@case("spiking.vector_steps.search", "spiking.vector_steps.similarity")
+def _a_position_is_decoded(draw):
+    space = SSPSpace.hexagonal(n_scales=2).double()
+    decoder, at = PositionDecoder(space), torch.from_numpy(draw.uniform(-0.9, 0.9, 2))
+    z = space.encode_fourier(at) + 0.1 * complex_of(draw, 18)
+    expected, parts, x = decoder(z), torch.view_as_real(z).numpy(), np.empty(2)
+    tables = decoder.tables()
+    best = vector_steps.search(tuple(tables), parts, x)
+    alike = vector_steps.similarity(tables.waves, parts, at.numpy())
+    return [
+        (expected.position_m.numpy(), x),
+        (expected.similarity.numpy(), best),
+        (decoder.similarity(z, at).numpy(), alike),
+    ]
 
 
 @functools.cache
