@@ -184,7 +184,7 @@ def complex_of(draw, *shape):
 @functools.cache
 def made(name):
     """Return a small module of SSP-SLAM, to be copied."""
-    space = SSPSpace.hexagonal(n_rotations=1, n_scales=2)
+    space = SSPSpace.hexagonal(n_scales=2)
     model = NeuronConfig(model="stepped_lif" if name == "stepped" else "lif", tau_ref_s=0.0023)
     if name in ("walk", "modules", "none"):
         coupling = {"walk": "manifold"}.get(name, name)
@@ -235,7 +235,7 @@ def _a_position_is_integrated_by_neurons(draw):
     for name in ("walk", "modules", "none"):
         walk = placed(with_state(made(name), draw), draw)
         walk.age.fill_(int(draw.choice([2, 3, 99])))
-        pull = None if draw.random() < 0.3 else complex_of(draw, 2, 6)
+        pull = None if draw.random() < 0.3 else complex_of(draw, 2, 18)
         pairs += by_both(walk, lambda w, pull=pull: [torch.view_as_real(w(velocity, pull))])
     return pairs
 
