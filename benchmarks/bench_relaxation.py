@@ -33,7 +33,7 @@ def laps(n: int, n_loops: int):
 
 def rows() -> list[Row]:
     poses, links = laps(*LARGE)
-    relaxation = Relaxation(*links, n=LARGE[0])
+    relaxation = Relaxation(*links)
     ms = cpu_ms(lambda: relaxation.run(poses, 1, 0.5), 50)
     many_ms = cpu_ms(lambda: relaxation.run(poses, 20, 0.5), 5) / 20
     size = f"{LARGE[0]} experiences"
@@ -42,11 +42,11 @@ def rows() -> list[Row]:
         Row("map relaxation, a loop of 20", size, "0.99 ms", "<= 1.0 ms", f"{many_ms:.2f} ms"),
     ]
     poses, links = laps(*SMALL)
-    relaxation = Relaxation(*links, n=SMALL[0])
+    relaxation = Relaxation(*links)
     size = f"{SMALL[0]} experiences"
     ms = cpu_ms(lambda: relaxation.run(poses, 20, 0.5), 200)
     found.append(Row("map relaxation, 20 loops", size, "-", "<= 0.6 ms", f"{ms:.2f} ms"))
-    ms = cpu_ms(lambda: Relaxation(*links, n=SMALL[0]), 500)
+    ms = cpu_ms(lambda: Relaxation(*links), 500)
     found.append(Row("map relaxation, after a new link", size, "-", "<= 0.2 ms", f"{ms:.3f} ms"))
     ms = cpu_ms(lambda: solve_pose_graph(poses, *links), 5)
     found.append(Row("map least squares, to the end", size, "-", "-", f"{ms:.1f} ms"))
@@ -57,7 +57,7 @@ def rows() -> list[Row]:
 def test_relaxation(benchmark, size, loops):
     torch.set_num_threads(1)
     poses, links = laps(*size)
-    relaxation = Relaxation(*links, n=size[0])
+    relaxation = Relaxation(*links)
     benchmark(relaxation.run, poses, loops, 0.5)
 
 

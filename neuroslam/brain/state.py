@@ -25,7 +25,7 @@ from neuroslam.merging.report import MergeReport
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
-from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, State
+from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, QuickModule, State
 from neuroslam.state.population import Population
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
@@ -50,7 +50,7 @@ class Clock(Scalars, AboutNow):
     frames_seen: int
 
 
-class BrainState(nn.Module):
+class BrainState(QuickModule):
     """State of a brain, its merging and its stored maps; a subclass processes frames.
 
     Args:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from neuroslam.cells.convolve import Cell, Kernels, Packet, circulant, trim, widen, widened_origin
+from neuroslam.compiled import compiled
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI, rotate_points
+from neuroslam.geometry import TWO_PI
 from neuroslam.types import PoseEstimate
 
 Headings = list[list[float]]
@@ -83,10 +84,7 @@ def settle(
     field = (field - global_inhibition).clamp_min(0.0)
     total = field.sum((-2, -1), keepdim=True)
     if total.min().item() <= 0.0:
-        raise MapError(
-            "pose cells: inhibition silenced every cell; global_inhibition "
-            f"{global_inhibition:g} is above all activity; lower it"
-        )
+        raise silenced(global_inhibition)
     field = (field / total).reshape(
         *batch, coupled.theta.shape[0], coupled.y.shape[-2], coupled.x.shape[-1]
     )
@@ -96,6 +94,14 @@ def settle(
         origin = (first - torch.tensor(reach, device=values.device)) % n
         return Packet(field, origin, packet.shape)
     return trim(Packet(field, widened_origin(packet, reach), packet.shape))
+
+
+def silenced(global_inhibition: float) -> MapError:
+    """Make the error of activity that inhibition has silenced."""
+    return MapError(
+        "pose cells: inhibition silenced every cell; global_inhibition "
+        f"{global_inhibition:g} is above all activity; lower it"
+    )
 
 
 def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Tensor:
@@ -131,6 +137,14 @@ def shift_matrix(shift: Tensor, first: int, n_out: int, n_in: int, n: int) -> Te
 def _offsets(first: int, n_out: int, n_in: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     rows = torch.arange(first, first + n_out, dtype=dtype, device=device)
     return rows[:, None] - torch.arange(n_in, dtype=dtype, device=device)
+
+
+def heading_table(n_theta: int) -> np.ndarray:
+    """Return cosine and sine of every layer's heading, ``(2, n_theta)``."""
+    return np.array([row[:n_theta] for row in _headings(n_theta, torch.float64, _CPU)[1]])
+
+
+_CPU = torch.device("cpu")
 
 
 @lru_cache(maxsize=16)
@@ -184,48 +198,6 @@ def path_integrate(
     o_theta, o_y, o_x = cast(Cell, packet.origin)
     origin = ((o_theta + first_theta) % n_theta, (o_y + first_y) % n_y, (o_x + first_x) % n_x)
     return Packet(turned, origin, packet.shape)
-
-
-def moved_cells(
-    cells: np.ndarray,
-    pivot: np.ndarray,
-    shift: np.ndarray,
-    torus: tuple[int, int, int],
-    paths: np.ndarray | None = None,
-) -> np.ndarray:
-    r"""Move pose-cell states on the torus so that the pivot coincides with another state.
-
-    .. math:: P' = P + \Delta \pmod n, \qquad \Delta = P_u - P_z
-
-    (Multisession RatSLAM, Eqs. 10 and 11; Eq. 10 is misprinted there.) If the two
-    sessions started with different headings, displacements differ in direction too; with ``paths``
-    they are rotated,
-
-    .. math:: P' = P_u + R(\Delta_\theta)\,(P - P_z)_\text{unwrapped} \pmod n
-
-    so that a robot that comes there in the other session has its activity there. The displacement
-    from :math:`P_z` to :math:`P` is unwrapped to the value nearest to ``paths``.
-
-    Args:
-        cells: x, y, theta in cells, ``(n, 3)``.
-        pivot: :math:`P_z`, ``(3,)``.
-        shift: :math:`\Delta` in cells, ``(3,)``; any fraction.
-        torus: ``(n_x, n_y, n_theta)``.
-        paths: Displacements from the pivot on the map, in cells, ``(n, 2)``; ``None``: shift only.
-
-    Example:
-        >>> moved_cells(np.array([[20.5, 3.0, 1.0]]), None, np.array([1, 0, -2]), (21, 21, 36))
-        array([[ 0.5,  3. , 35. ]])
-    """
-    n = np.array(torus, dtype=np.float64)
-    moved = cells + shift
-    if paths is not None:
-        apart = cells[:, :2] - pivot[:2]
-        apart = apart + n[:2] * np.round((paths - apart) / n[:2])
-        turned = rotate_points(apart, TWO_PI * shift[2] / n[2])
-        moved[:, :2] = pivot[:2] + shift[:2] + turned
-    moved = moved % n
-    return np.where(moved >= n, 0.0, moved)  # a tiny negative rounds up to n
 
 
 def _window(size: int, n: int, low: float, high: float) -> tuple[int, int]:
@@ -301,3 +273,338 @@ def decode(packet: Packet, radius: int) -> PoseEstimate:
         co = sum(w * math.cos(unit * (low + i - p)) for i, w in enumerate(weights))
         found.append((origin + p - roll + math.atan2(s, co) / unit) % n)
     return PoseEstimate(found[2], found[1], found[0])
+
+
+@compiled
+def advance(
+    values: np.ndarray,
+    sizes: Cell,
+    origin: Cell,
+    torus: Cell,
+    excite: np.ndarray,
+    inhibit: np.ndarray,
+    global_inhibition: float,
+    distance_cells: float,
+    turn_cells: float,
+    aside_cells: tuple[float, float],
+    headings: np.ndarray,
+    radius: int,
+    single: bool,
+) -> tuple[np.ndarray, Cell, Cell, tuple[float, float, float]]:
+    """Advance one brain by a frame: :func:`settle`, :func:`path_integrate`, :func:`decode`.
+
+    Windows of compiled steps are flat, ``float64``.
+
+    Args:
+        values: Activity of the window.
+        sizes: Its cells along theta, y and x.
+        origin: Its first cell on the torus.
+        torus: Cells of the torus along theta, y and x.
+        excite: 1-D factors for theta, y and x, ``(3, size)``.
+        inhibit: The same of the inhibition.
+        global_inhibition: Activity removed from every cell.
+        distance_cells: Displacement of each layer along its heading.
+        turn_cells: Displacement of all layers along theta.
+        aside_cells: Displacement of all layers along x and y.
+        headings: Cosine and sine of every layer's heading, ``(2, n_theta)``.
+        radius: Cells on each side of the peak that are decoded.
+        single: Whether activity is rounded to single precision.
+
+    Returns:
+        The window, its sizes and origin, and the estimate: x, y, theta. The window is empty if
+        every cell is silent.
+    """
+    reach = excite.shape[1] // 2
+    field, wide = _convolve(values, sizes, torus, excite, reach)
+    inhibited, _ = _convolve(field, wide, torus, inhibit, 0 * reach)  # 0 alone compiles again
+    sums = np.zeros(8)  # a single sum waits for each addition
+    for i in range(field.size):
+        field[i] = max(field[i] - inhibited[i] - global_inhibition, 0.0)
+    for i in range(field.size):
+        sums[i % 8] += field[i]
+    total = sums.sum()
+    if not total > 0.0:
+        return field[:0], wide, origin, (0.0, 0.0, 0.0)
+    for i in range(field.size):
+        field[i] /= total
+    first = (
+        (origin[0] - reach) % torus[0],
+        (origin[1] - reach) % torus[1],
+        (origin[2] - reach) % torus[2],
+    )
+    field, wide, first = _trim(field, wide, first, torus)
+    moved, wide, first = _move(
+        field, wide, first, torus, distance_cells, turn_cells, aside_cells, headings
+    )
+    if single:
+        for i in range(moved.size):
+            moved[i] = np.float32(moved[i])
+    return moved, wide, first, decode_window(moved, wide, first, torus, radius)
+
+
+@compiled
+def _convolve(
+    values: np.ndarray, sizes: Cell, torus: Cell, kernels: np.ndarray, lead: int
+) -> tuple[np.ndarray, Cell]:
+    """Convolve a window that widens by ``lead`` cells on each side."""
+    a, b, c = sizes
+    one = min(a, 1)  # a literal 1 would be compiled for on its own
+    a_out, b_out, c_out = (
+        min(a + 2 * lead, torus[0]),
+        min(b + 2 * lead, torus[1]),
+        min(c + 2 * lead, torus[2]),
+    )
+    field = _along_x(values, a * b, c, torus[2], kernels[2], lead)
+    field = _along(field, a, b, c_out, torus[1], kernels[1], lead)
+    field = _along(field, one, a, b_out * c_out, torus[0], kernels[0], lead)
+    return field, (a_out, b_out, c_out)
+
+
+@compiled
+def _along(
+    source: np.ndarray, rows: int, size: int, inner: int, n: int, kernel: np.ndarray, lead: int
+) -> np.ndarray:
+    """Convolve rows of cells, each row a stretch of a ring of ``n``, each cell ``inner`` numbers.
+
+    The whole stretch is added at once, shifted by each weight's place.
+    """
+    size_out = min(size + 2 * lead, n)
+    out = np.zeros(rows * size_out * inner)
+    for row in range(rows):
+        for m in range(kernel.size):
+            for turns in range(-n, n + 1, n):  # what leaves the ring at one end enters at the other
+                shift = m - kernel.size // 2 + lead + turns
+                low, high = max(0, -shift), min(size, size_out - shift)
+                if low < high:
+                    weight = kernel[m]
+                    arriving = source[(row * size + low) * inner :]
+                    reached = out[(row * size_out + low + shift) * inner :]
+                    for k in range((high - low) * inner):
+                        reached[k] += weight * arriving[k]
+    return out
+
+
+@compiled
+def _along_x(
+    source: np.ndarray, rows: int, size: int, n: int, kernel: np.ndarray, lead: int
+) -> np.ndarray:
+    """Do the same where a cell is one number: all rows at once, as the rows are short.
+
+    Each row stands between margins, which hold what the ring has there.
+    """
+    reach = kernel.size // 2
+    size_out = min(size + 2 * lead, n)
+    width = size_out + 2 * reach
+    padded, sums, out = np.zeros(rows * width), np.zeros(rows * width), np.empty(rows * size_out)
+    for t in range(width):
+        cell = (t - lead - reach) % n
+        if cell < size:
+            for row in range(rows):
+                padded[row * width + t] = source[row * size + cell]
+    span = sums.size - 2 * reach
+    for m in range(kernel.size):
+        weight, shifted = kernel[m], padded[2 * reach - m :]
+        for k in range(span):
+            sums[k] += weight * shifted[k]
+    for row in range(rows):
+        for k in range(size_out):
+            out[row * size_out + k] = sums[row * width + k]
+    return out
+
+
+@compiled
+def _span(active: np.ndarray, n: int) -> tuple[int, int]:
+    """Return the first active cell and how many to keep; a whole ring opens at its longest gap."""
+    first = last = widest = start = -1
+    for i in range(active.size):
+        if active[i] > 0.0:
+            if first < 0:
+                first = i
+            elif i - last > widest:
+                widest, start = i - last, i
+            last = i
+    if last - first + 1 == n and widest > 1:
+        return start, n - widest + 1
+    return first, last - first + 1
+
+
+@compiled
+def _trim(
+    values: np.ndarray, sizes: Cell, origin: Cell, torus: Cell
+) -> tuple[np.ndarray, Cell, Cell]:
+    """Cut silent planes from the sides of a window."""
+    a, b, c = sizes
+    planes, rows, columns = np.zeros(a), np.zeros(b), np.zeros(c)
+    for i in range(a):
+        for j in range(b):
+            most, at = 0.0, (i * b + j) * c
+            for k in range(c):
+                value = values[at + k]
+                columns[k] = max(columns[k], value)
+                most = max(most, value)
+            planes[i], rows[j] = max(planes[i], most), max(rows[j], most)
+    i0, a_out = _span(planes, torus[0])
+    j0, b_out = _span(rows, torus[1])
+    k0, c_out = _span(columns, torus[2])
+    kept, to = np.empty(a_out * b_out * c_out), 0
+    for i in range(a_out):
+        for j in range(b_out):
+            at = ((i0 + i) % a * b + (j0 + j) % b) * c
+            for k in range(k0, k0 + c_out):
+                kept[to] = values[at + (k if k < c else k - c)]
+                to += 1
+    first = ((origin[0] + i0) % torus[0], (origin[1] + j0) % torus[1], (origin[2] + k0) % torus[2])
+    return kept, (a_out, b_out, c_out), first
+
+
+@compiled
+def _move(
+    values: np.ndarray,
+    sizes: Cell,
+    origin: Cell,
+    torus: Cell,
+    distance_cells: float,
+    turn_cells: float,
+    aside_cells: tuple[float, float],
+    headings: np.ndarray,
+) -> tuple[np.ndarray, Cell, Cell]:
+    """Move the activity of a window."""
+    a, b, c = sizes
+    along_x, along_y = np.empty(a), np.empty(a)
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for i in range(a):
+        layer = (origin[0] + i) % torus[0]
+        x = distance_cells * headings[0, layer] + aside_cells[0]
+        y = distance_cells * headings[1, layer] + aside_cells[1]
+        along_x[i], along_y[i] = x, y
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+    first_x, first_y, first_theta = math.floor(low_x), math.floor(low_y), math.floor(turn_cells)
+    a_out = min(a + math.ceil(turn_cells) - first_theta, torus[0])
+    b_out = min(b + math.ceil(high_y) - first_y, torus[1])
+    c_out = min(c + math.ceil(high_x) - first_x, torus[2])
+    ahead_theta = turn_cells - first_theta
+    layer_size = b_out * c_out
+    out, plane = np.zeros(a_out * layer_size), np.empty(layer_size)
+    for i in range(a):
+        whole_x, whole_y = math.floor(along_x[i]), math.floor(along_y[i])
+        ahead_x, ahead_y = along_x[i] - whole_x, along_y[i] - whole_y
+        shift_x, shift_y = whole_x - first_x, whole_y - first_y
+        plane[:] = 0.0
+        for j in range(b):
+            for up in range(2):  # a weight is 0 where the cell lies beyond the window
+                weight_y = ahead_y if up else 1.0 - ahead_y
+                if weight_y == 0.0:
+                    continue
+                row = (j + shift_y + up) % torus[1] * c_out
+                for k in range(c):
+                    value = weight_y * values[(i * b + j) * c + k]
+                    to = k + shift_x
+                    plane[row + (to if to < c_out else to - torus[2])] += (1.0 - ahead_x) * value
+                    if ahead_x > 0.0:
+                        to += 1
+                        plane[row + (to if to < c_out else to - torus[2])] += ahead_x * value
+        for up in range(2):
+            weight = ahead_theta if up else 1.0 - ahead_theta
+            if weight > 0.0:
+                sink = out[(i + up) % torus[0] * layer_size :]
+                for k in range(layer_size):
+                    sink[k] += weight * plane[k]
+    first = (
+        (origin[0] + first_theta) % torus[0],
+        (origin[1] + first_y) % torus[1],
+        (origin[2] + first_x) % torus[2],
+    )
+    return out, (a_out, b_out, c_out), first
+
+
+@compiled
+def decode_window(
+    values: np.ndarray, sizes: Cell, origin: Cell, torus: Cell, radius: int
+) -> tuple[float, float, float]:
+    """Decode x, y and theta of the dominant packet: :func:`decode`; arguments of :func:`advance`.
+
+    Where a window is the whole ring its cells are taken around the peak; else it has two ends.
+    """
+    b, c = sizes[1], sizes[2]
+    peak = 0
+    for i in range(values.size):
+        if values[i] > values[peak]:
+            peak = i
+    peaks = (peak // (b * c), peak // c % b, peak % c)
+    width = 2 * radius + 1
+    cells, sums = np.full((3, width), -1), np.zeros((3, width))
+    for axis in range(3):
+        size, n = sizes[axis], torus[axis]
+        for i in range(width):
+            at = peaks[axis] + i - radius
+            if size < n and 0 <= at < size:
+                cells[axis, i] = at
+            elif size == n and -(n // 2) <= i - radius < n - n // 2:
+                cells[axis, i] = at % n
+    for i in range(width):
+        for j in range(width):
+            at = (cells[0, i] * b + cells[1, j]) * c
+            if cells[0, i] < 0 or cells[1, j] < 0:
+                continue
+            for k in range(width):
+                if cells[2, k] >= 0:
+                    value = values[at + cells[2, k]]
+                    sums[0, i] += value
+                    sums[1, j] += value
+                    sums[2, k] += value
+    found = np.empty(3)
+    for axis in range(3):
+        unit = TWO_PI / torus[axis]
+        s = co = 0.0
+        for i in range(width):
+            s += sums[axis, i] * math.sin(unit * (i - radius))
+            co += sums[axis, i] * math.cos(unit * (i - radius))
+        found[axis] = (origin[axis] + peaks[axis] + math.atan2(s, co) / unit) % torus[axis]
+    return found[2], found[1], found[0]
+
+
+@compiled
+def inject_window(
+    values: np.ndarray,
+    sizes: Cell,
+    origin: Cell,
+    torus: Cell,
+    at: tuple[float, float, float],
+    energy: float,
+) -> tuple[np.ndarray, Cell, Cell]:
+    """Add activity at theta, y, x: :func:`inject`; arguments and window of :func:`advance`."""
+    low = (math.floor(at[0]), math.floor(at[1]), math.floor(at[2]))
+    before, after = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for axis in range(3):
+        size, n = sizes[axis], torus[axis]
+        ahead = (low[axis] - origin[axis]) % n
+        after[axis] = max(0, ahead + 2 - size) if size < n else 0
+        if after[axis] and n - ahead <= after[axis]:  # fewer cells if the window grows backward
+            before[axis] = n - ahead
+            after[axis] = max(0, 2 - before[axis] - size)
+        after[axis] = min(after[axis], n - size - before[axis])
+    a, b, c = sizes
+    wide = (before[0] + a + after[0], before[1] + b + after[1], before[2] + c + after[2])
+    first = (
+        (origin[0] - before[0]) % torus[0],
+        (origin[1] - before[1]) % torus[1],
+        (origin[2] - before[2]) % torus[2],
+    )
+    out = np.zeros(wide[0] * wide[1] * wide[2])
+    for i in range(a):
+        for j in range(b):
+            to = ((before[0] + i) * wide[1] + before[1] + j) * wide[2] + before[2]
+            for k in range(c):
+                out[to + k] = values[(i * b + j) * c + k]
+    for corner in range(8):
+        weight, cell = energy, 0
+        for axis in range(3):
+            up = corner >> axis & 1
+            ahead = at[axis] - low[axis]
+            weight *= ahead if up else 1.0 - ahead
+            cell = cell * wide[axis] + (low[axis] + up - first[axis]) % torus[axis]
+        if weight != 0.0:
+            out[cell] += weight
+    return out, wide, first

@@ -9,10 +9,23 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuroslam.cells.attractor import Couplings, couplings, decode, inject, path_integrate, settle
-from neuroslam.cells.convolve import Kernels, Packet, gaussian_difference, to_dense, to_packet
+from neuroslam.cells.attractor import (
+    Couplings,
+    advance,
+    couplings,
+    decode,
+    decode_window,
+    heading_table,
+    inject,
+    inject_window,
+    path_integrate,
+    settle,
+    silenced,
+)
+from neuroslam.cells.convolve import Cell, Kernels, Packet, gaussian_difference, to_dense, to_packet
 from neuroslam.cells.pose_joining import move_session
 from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all
+from neuroslam.compiled import runs_compiled
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.errors import MapError, listed
 from neuroslam.geometry import TWO_PI
@@ -48,6 +61,20 @@ class _Now:
 
 def _no_slip(like: Tensor) -> list[float] | Tensor:
     return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
+
+
+def _flat(packet: Packet) -> tuple[np.ndarray, Cell, Cell, Cell]:
+    """Return values, sizes, origin and torus for a compiled step."""
+    values = packet.values.numpy()
+    a, b, c = values.shape
+    flat = values.reshape(-1).astype(np.float64)
+    return flat, (a, b, c), cast(Cell, packet.origin), packet.shape
+
+
+def _window(values: np.ndarray, sizes: Cell, origin: Cell, like: Packet) -> Packet:
+    """Make a packet of a compiled step's flat window."""
+    window = torch.from_numpy(values.reshape(sizes)).to(like.values.dtype)
+    return Packet(window, origin, like.shape)
 
 
 @register("pose")
@@ -103,6 +130,7 @@ class PoseCellNetwork(Population):
         slip = torch.zeros(*brains, 3, dtype=torch.float64)
         self.register_buffer("slip", slip)
         self._couplings: dict[tuple[int, int, int], Couplings] = {}
+        self._loops: tuple[np.ndarray, ...] | None = None  # kernels and headings of compiled steps
         # The state in use is here: writing buffers in each step would cost more than the cells.
         self._now = _Now(Packet(self.window, (0, 0, 0), self.shape), slip)
         self.register_state_dict_pre_hook(lambda module, *_: module._write_buffers())
@@ -156,9 +184,16 @@ class PoseCellNetwork(Population):
     def estimate(self) -> PoseEstimate | Tensor:
         """Centre of the dominant packet in cells; in a batch x, y, theta, shape ``(batch, 3)``."""
         if self._now.estimate is None:
-            find = decode if self.batch is None else decode_all
-            self._now.estimate = find(self._now.packet, self.config.decode_radius)
+            self._now.estimate = self._decoded()
         return self._now.estimate
+
+    def _decoded(self) -> PoseEstimate | Tensor:
+        packet, radius = self._now.packet, self.config.decode_radius
+        if self.batch is not None:
+            return decode_all(packet, radius)
+        if not runs_compiled(packet.values):
+            return decode(packet, radius)
+        return PoseEstimate(*decode_window(*_flat(packet), radius))
 
     @property
     def peak(self) -> float:
@@ -175,7 +210,49 @@ class PoseCellNetwork(Population):
             MapError: If inhibition silenced every cell.
         """
         c, now = self.config, self._now
-        a, b, width = now.packet.values.shape[-3:]
+        distance = motion.v_m_s * motion.dt_s / c.cell_size_m
+        turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
+        follows = c.exact_gain and not now.injected
+        if not follows:
+            now.slip = _no_slip(self.slip)
+            now.injected = False
+        before = self.estimate if follows else None
+        if self.batch is None:
+            self._move_one(distance, turn)
+            if follows:
+                self._measure_slip(cast(PoseEstimate, before), distance, turn)
+        else:
+            settled, slip = trim_all(self._settled()), cast(Tensor, now.slip)
+            self.packet = move_all(settled, distance, turn + slip[:, 2], slip[:, :2])
+            if follows:
+                self._measure_slips(cast(Tensor, before), distance, turn)
+        return self.estimate
+
+    def _move_one(self, distance: float, turn: float) -> None:
+        """Settle and move the activity of one brain, with the slip that is fed back."""
+        c, now = self.config, self._now
+        x, y, theta = cast(list[float], now.slip)
+        values = now.packet.values
+        if not runs_compiled(values) or isinstance(distance, Tensor):
+            self.packet = path_integrate(self._settled(), distance, turn + theta, (x, y))
+            return
+        if self._loops is None:
+            kernels = (np.stack([k.numpy() for k in made]) for made in self.kernels)
+            self._loops = (*kernels, heading_table(c.n_theta))
+        excite, inhibit, headings = self._loops
+        moved, sizes, origin, estimate = advance(
+            *_flat(now.packet), excite, inhibit, c.global_inhibition, distance, turn + theta,
+            (x, y), headings, c.decode_radius, c.precision == "float32",
+        )  # fmt: skip
+        if not moved.size:
+            raise silenced(c.global_inhibition)
+        now.packet = _window(moved, sizes, origin, now.packet)
+        now.estimate = PoseEstimate(*estimate)
+
+    def _settled(self) -> Packet:
+        """Excite, inhibit and normalise the activity."""
+        c, packet = self.config, self._now.packet
+        a, b, width = packet.values.shape[-3:]
         sizes = (a, b, width)
         coupled = self._couplings.get(sizes)
         if coupled is None:
@@ -186,26 +263,7 @@ class PoseCellNetwork(Population):
                 )
             self._couplings[sizes] = coupled
         half = c.excite_size // 2
-        reach = (half, half, half)
-        distance = motion.v_m_s * motion.dt_s / c.cell_size_m
-        turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
-        follows = c.exact_gain and not now.injected
-        if not follows:
-            now.slip = _no_slip(self.slip)
-            now.injected = False
-        before = self.estimate if follows else None
-        settled = settle(now.packet, coupled, reach, c.global_inhibition)
-        if self.batch is None:
-            x, y, theta = cast(list[float], now.slip)
-            self.packet = path_integrate(settled, distance, turn + theta, (x, y))
-            if follows:
-                self._measure_slip(cast(PoseEstimate, before), distance, turn)
-        else:
-            settled, slip = trim_all(settled), cast(Tensor, now.slip)
-            self.packet = move_all(settled, distance, turn + slip[:, 2], slip[:, :2])
-            if follows:
-                self._measure_slips(cast(Tensor, before), distance, turn)
-        return self.estimate
+        return settle(packet, coupled, (half, half, half), c.global_inhibition)
 
     def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
         """Move and rotate the activity by a correction of the pose."""
@@ -302,7 +360,12 @@ class PoseCellNetwork(Population):
         )
         if c.inject_at_cell:
             at = PoseEstimate(*(math.floor(value) for value in at))
-        self.packet = inject(self.packet, at, energy)
+        packet = self.packet
+        if runs_compiled(packet.values):
+            where = (float(at.theta), float(at.y), float(at.x))
+            self.packet = _window(*inject_window(*_flat(packet), where, energy), packet)
+        else:
+            self.packet = inject(packet, at, energy)
         self._now.injected = True
 
     def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:

@@ -163,7 +163,7 @@ def solve(graph: Graph, method: str) -> tuple[np.ndarray, np.ndarray]:
     if method == "odometry":
         return graph.poses, ~graph.is_match
     if method == "relax":
-        relaxation = Relaxation(*links, np.nan_to_num(graph.facing_rad), n=len(graph.poses))
+        relaxation = Relaxation(*links, np.nan_to_num(graph.facing_rad))
         poses, _ = relaxation.run(graph.poses, RELAX_LOOPS, 0.5, RELAX_REST)
         return poses, np.ones(len(graph.source), dtype=bool)
     poses, report = solve_pose_graph(

@@ -61,13 +61,12 @@ class ExperienceMap(ExperienceGraph):
         action: Action = "none"
         if view.template != NO_TEMPLATE:
             turned = view.relative_heading_rad * self.torus[2] / TWO_PI
-            templates = self.experiences["template"].numpy(force=True)
-            ids = np.flatnonzero(templates == view.template)
             action, found = choose_action(
                 cells,
                 turned,
-                self.experiences["cell"].numpy(force=True)[ids],
-                ids,
+                self.experiences.array("cell"),
+                self.experiences.array("template"),
+                view.template,
                 self.state.current,
                 self.threshold_cells,
                 self.torus,
@@ -119,7 +118,7 @@ class ExperienceMap(ExperienceGraph):
         s = self.state
         x = y = 0.0
         if s.current != NO_EXPERIENCE:
-            x, y, _ = self.experiences["pose"][s.current].tolist()
+            x, y, _ = self.experiences.array("pose")[s.current].tolist()
         s.dx_m, s.dy_m, s.facing_rad = pose.x_m - x, pose.y_m - y, wrap_angle(pose.theta_rad)
 
     def nudge(self, dx_m: float, dy_m: float, turn_rad: float) -> None:
@@ -215,30 +214,29 @@ class ExperienceMap(ExperienceGraph):
         if s.at_rest or not self.links_table.n or not loops:
             s.largest_correction = 0.0
             return 0.0
-        poses = self.experiences["pose"]
+        poses = self.experiences.array("pose")
         if c.solver == "least_squares":
             links = self.links
             solved, _ = solve_pose_graph(
-                poses.numpy(),
+                poses,
                 *links[:5],
                 sigma_m=c.sigma_m,
                 sigma_rad=c.sigma_rad,
                 rejectable=closes_loop(*links[:2]) if c.robust else None,
             )
-            moved = solved - poses.numpy()
+            moved = solved - poses
             moved[:, 2] = wrap_angles(moved[:, 2])
             s.largest_correction = float(np.abs(moved).max())
             s.at_rest = 1  # solved, until the next new link
         else:
             if self._relaxation is None:
-                links = self.links
-                self._relaxation = Relaxation(*links[:5], n=self.n)
+                self._relaxation = Relaxation(*self.links[:5])
             solved, s.largest_correction = self._relaxation.run(
-                poses.numpy(), loops, c.correction, c.rest_tolerance
+                poses, loops, c.correction, c.rest_tolerance
             )
             s.at_rest = int(s.largest_correction <= c.rest_tolerance)
-        turned = solved[s.current, 2].item() - poses[s.current, 2].item()
-        poses.copy_(torch.from_numpy(solved))
+        turned = float(solved[s.current, 2] - poses[s.current, 2])
+        poses[:] = solved
         self._turn_offset(wrap_angle(turned))
         return s.largest_correction
 
@@ -300,7 +298,7 @@ class ExperienceMap(ExperienceGraph):
 
     def _add_link(self, source: int, target: int, relative_heading_rad: float) -> None:
         s = self.state
-        heading = self.experiences["pose"][source, 2].item()
+        heading = self.experiences.array("pose")[source, 2].item()
         self.links_table.append(
             source=source,
             target=target,
@@ -315,7 +313,7 @@ class ExperienceMap(ExperienceGraph):
         s = self.state
         s.current = experience
         s.dx_m = s.dy_m = s.since_s = 0.0
-        heading = self.experiences["pose"][experience, 2].item()
+        heading = self.experiences.array("pose")[experience, 2].item()
         s.facing_rad = wrap_angle(heading + relative_heading_rad)
 
     def _turn_offset(self, by_rad: float) -> None:

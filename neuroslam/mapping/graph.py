@@ -113,17 +113,17 @@ class ExperienceGraph(Mergeable):
     @property
     def pose_table(self) -> np.ndarray:
         """Poses of all experiences, ``(n, 3)``; a read-only view of the state."""
-        return self.experiences["pose"].numpy(force=True)
+        return self.experiences.array("pose")
 
     @property
     def poses(self) -> np.ndarray:
         """Poses of all experiences, ``(n, 3)``: x, y in metres, heading in radians; a copy."""
-        return self.experiences["pose"].numpy(force=True).copy()
+        return self.experiences.array("pose").copy()
 
     @property
     def links(self) -> Links:
         """All links, as arrays; a copy."""
-        return Links(*(self.links_table[c].numpy(force=True).copy() for c in Links._fields))
+        return Links(*(self.links_table.array(c).copy() for c in Links._fields))
 
     @property
     def largest_correction(self) -> float:
@@ -136,7 +136,7 @@ class ExperienceGraph(Mergeable):
         s = self.state
         if s.current == NO_EXPERIENCE:
             return Pose(s.dx_m, s.dy_m, s.facing_rad)
-        x, y, _ = self.experiences["pose"][s.current].tolist()
+        x, y, _ = self.experiences.array("pose")[s.current].tolist()
         return Pose(x + s.dx_m, y + s.dy_m, s.facing_rad)
 
     @property
@@ -145,7 +145,7 @@ class ExperienceGraph(Mergeable):
         s = self.state
         heading = 0.0
         if s.current != NO_EXPERIENCE:
-            heading = self.experiences["pose"][s.current, 2].item()
+            heading = self.experiences.array("pose")[s.current, 2].item()
         dx, dy = rotate(s.dx_m, s.dy_m, -heading)
         return Pose(dx, dy, wrap_angle(s.facing_rad - heading))
 
@@ -156,7 +156,7 @@ class ExperienceGraph(Mergeable):
             MapError: If there is no such experience.
         """
         self._check(experience)
-        source, target = (self.links_table[c].numpy(force=True) for c in ("source", "target"))
+        source, target = (self.links_table.array(c) for c in ("source", "target"))
         near = np.concatenate([target[source == experience], source[target == experience]])
         return np.unique(near).tolist()
 
@@ -167,7 +167,7 @@ class ExperienceGraph(Mergeable):
             MapError: If there is no such experience.
         """
         self._check(experience)
-        x, y, _ = self.experiences["pose"][experience].tolist()
+        x, y, _ = self.experiences.array("pose")[experience].tolist()
         here = self.pose
         dx, dy = x - here.x_m, y - here.y_m
         return math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - here.theta_rad)
@@ -224,7 +224,7 @@ class ExperienceGraph(Mergeable):
         return merge_maps(loaded, partial, join)
 
     def _linked(self, a: int, b: int) -> bool:
-        source, target = (self.links_table[c].numpy(force=True) for c in ("source", "target"))
+        source, target = (self.links_table.array(c) for c in ("source", "target"))
         return bool((((source == a) & (target == b)) | ((source == b) & (target == a))).any())
 
     def _check(self, experience: int) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -33,6 +34,7 @@ class GrowingTable(nn.Module):
         super().__init__()
         self.n = 0
         self.columns = tuple(columns)
+        self._arrays: dict[str, tuple[Tensor, np.ndarray]] = {}
         for name, (shape, dtype) in columns.items():
             self.register_buffer(name, torch.empty((0, *shape), dtype=dtype))
         self.register_load_state_dict_pre_hook(_resize_to_saved)
@@ -42,7 +44,11 @@ class GrowingTable(nn.Module):
         """Add one row, a value for every column, and return its number."""
         self._make_room()
         for name in self.columns:
-            self._column(name)[self.n] = row[name]
+            column, value = self._column(name), row[name]
+            if column.device.type == "cpu":
+                self._whole(name)[self.n] = value
+            else:
+                column[self.n] = value
         self.n += 1
         return self.n - 1
 
@@ -93,6 +99,21 @@ class GrowingTable(nn.Module):
     def __getitem__(self, name: str) -> Tensor:
         """Return the used part of a column, a view: writing to it changes the table."""
         return self._column(name)[: self.n]
+
+    def array(self, name: str) -> np.ndarray:
+        """Return the used part of a column on the CPU as numpy's view, a few times faster."""
+        return self._whole(name)[: self.n]
+
+    def _whole(self, name: str) -> np.ndarray:
+        column = self._column(name)
+        tensor, whole = self._arrays.get(name, (None, None))
+        if whole is None or tensor is not column:
+            self._arrays[name] = column, whole = column, column.numpy()
+        return whole
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy keeps: numpy's views are of this table's columns alone."""
+        return self.__dict__ | {"_arrays": {}}
 
     def __len__(self) -> int:
         """Return the number of rows in use."""

@@ -147,7 +147,7 @@ def test_actions_follow_view_and_cells():
 def test_the_distance_between_cells_is_that_on_the_torus(shift, n):
     bound = np.array([[0.0, 0.0, 0.0]])
     at = PoseEstimate(shift % n, 0.0, 0.0)
-    action, _ = choose_action(at, 0.0, bound, np.array([0]), 5, 2.0, (n, n, 36))
+    action, _ = choose_action(at, 0.0, bound, np.array([8]), 8, 5, 2.0, (n, n, 36))
     ring = min(shift % n, n - shift % n)
     assert action == ("link" if ring <= 2.0 else "create")
 
