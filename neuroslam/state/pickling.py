@@ -77,7 +77,11 @@ def as_tensors(state: dict[str, np.ndarray]) -> dict[str, Tensor]:
     return {name: torch.tensor(array) for name, array in state.items()}
 
 
-def _pack(value: object) -> object:
+def _pack(value: Any) -> Any:  # noqa: ANN401
+    if type(value) in (list, tuple) and any(isinstance(item, Tensor) for item in value):
+        return type(value)(_pack(item) for item in value)
+    if type(value) is dict and any(isinstance(item, Tensor) for item in value.values()):
+        return {key: _pack(item) for key, item in value.items()}
     if not isinstance(value, Tensor) or type(value) not in (Tensor, nn.Parameter):
         return value
     try:
@@ -88,7 +92,11 @@ def _pack(value: object) -> object:
     return PackedTensor(array, str(value.device), value.requires_grad, is_parameter)
 
 
-def _unpack(value: object) -> object:
+def _unpack(value: Any) -> Any:  # noqa: ANN401
+    if type(value) in (list, tuple) and any(isinstance(item, PackedTensor) for item in value):
+        return type(value)(_unpack(item) for item in value)
+    if type(value) is dict and any(isinstance(item, PackedTensor) for item in value.values()):
+        return {key: _unpack(item) for key, item in value.items()}
     if not isinstance(value, PackedTensor):
         return value
     tensor = torch.tensor(value.array, device=value.device)
