@@ -1,6 +1,7 @@
 """Velocity-controlled oscillators: phases that advance with displacement along a direction."""
 
 import math
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -191,7 +192,7 @@ class VelocityOscillators(BufferModule):
                 self._waves = version, waves, torch.linalg.pinv(waves.flatten(0, 1))
         return self._waves[1:]
 
-    def _apply(self, fn: object, recurse: bool = True) -> "VelocityOscillators":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VelocityOscillators":
         self._waves = None
         return super()._apply(fn, recurse)
 

@@ -6,7 +6,7 @@ and the merge of two sessions. After Kropff et al. (2015, *Nature* 523:
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, Self, cast
 
 import numpy as np
@@ -307,7 +307,7 @@ class SpeedCells(Population):
         self._draw.set_state(self.draws.cpu())
         self.readout = fit_readout(self.tuning, self.config.max_speed_m_s)
 
-    def _apply(self, fn: object, recurse: bool = True) -> "SpeedCells":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "SpeedCells":
         super()._apply(fn, recurse)
         self.readout = self.readout.to(self.rates_hz)
         return self
