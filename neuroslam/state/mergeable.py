@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from neuroslam.errors import MapError
 from neuroslam.state.join import Join
 from neuroslam.state.pickling import packed, unpacked
+from neuroslam.threads import without_autocast
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -194,13 +195,13 @@ def _make_room(module: BufferModule, state: State, prefix: str, *_unused: object
 
 
 def without_gradients(step: Callable[P, T]) -> Callable[P, T]:
-    """Let a step run in inference mode; one that does so already loses no time by it."""
+    """Let a step run in inference mode and without autocast; in a brain it loses no time by it."""
 
     @wraps(step)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
         if torch.is_inference_mode_enabled():
             return step(*args, **kwargs)
-        with torch.inference_mode():
+        with torch.inference_mode(), without_autocast():
             return step(*args, **kwargs)
 
     return run
