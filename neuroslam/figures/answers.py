@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
 from neuroslam.errors import counted
+from neuroslam.figures.density import SIGMAS, Spread, draw_ellipse
 from neuroslam.figures.landmarks import style_of_words
 from neuroslam.figures.style import INK, LOOP, ODOMETRY, STYLE, WALL, new_figure, write_title
 from neuroslam.spiking.ask import Answer, Found
@@ -58,6 +59,10 @@ def _extent(answer: Answer, positions_m: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return the corners of the plane that is drawn."""
     points: list[Any] = [positions_m, *([one.position_m] for one in answer.everything)]
     points += [one.corners_m for one in answer.everything if one.corners_m]
+    for one in answer.everything:
+        if one.covariance_m2:
+            half = SIGMAS[-1] * np.sqrt(np.diagonal(np.array(one.covariance_m2)))
+            points.append(np.array(one.position_m) + np.stack([-half, half]))
     if answer.question.numbers:
         points.append(np.reshape(answer.question.numbers, (-1, 2)))
     every = np.concatenate([np.reshape(p, (-1, 2)) for p in points if len(p)] or [np.zeros((1, 2))])
@@ -80,6 +85,10 @@ def _draw(axes: Axes, one: Found, is_found: bool) -> None:
     else:
         style: dict[str, Any] = {"ls": "none", "ms": 9, "mec": "white", "mew": 0.9, "zorder": 6}
         axes.plot(*one.position_m, **style, **style_of_words(one.words), **strong)
+    if one.covariance_m2:
+        spread = Spread(np.array(one.position_m), np.array(one.covariance_m2))
+        label = _once(axes, "1 and 2 standard deviations")
+        draw_ellipse(axes, spread, label=label, colour=LOOP if is_found else ODOMETRY)
     if is_found and one.kind == "landmark":
         ring: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 16, "mfc": "none", "mew": 1.4}
         axes.plot(*one.position_m, mec=LOOP, zorder=7, label=_once(axes, "found"), **ring)
