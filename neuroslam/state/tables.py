@@ -45,7 +45,11 @@ class GrowingTable(nn.Module):
         if self.n == self._column(self.columns[0]).shape[0]:
             self.reserve(max(16, 2 * self.n))
         for name in self.columns:
-            self._column(name)[self.n] = row[name]
+            column, value = self._column(name), row[name]
+            if column.device.type == "cpu":
+                self._whole(name)[self.n] = value
+            else:
+                column[self.n] = value
         self.n += 1
         return self.n - 1
 
@@ -77,11 +81,14 @@ class GrowingTable(nn.Module):
 
     def array(self, name: str) -> np.ndarray:
         """Return the used part of a column on the CPU as numpy's view, a few times faster."""
+        return self._whole(name)[: self.n]
+
+    def _whole(self, name: str) -> np.ndarray:
         column = self._column(name)
         tensor, whole = self._arrays.get(name, (None, None))
         if whole is None or tensor is not column:
             self._arrays[name] = column, whole = column, column.numpy()
-        return whole[: self.n]
+        return whole
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy keeps: numpy's views are of this table's columns alone."""
