@@ -22,6 +22,7 @@ class Source(ABC):
         live: Whether the source is live: its frames cannot be read a second time.
         unused: Data that is in no frame, and why, one line each; complete once the source was
             read to its end.
+        notes: How the source was understood where its data did not say it, one line each.
         landmark_words: Names and attributes of its landmarks, empty if it knows none.
     """
 
@@ -30,6 +31,7 @@ class Source(ABC):
     frame_rate_hz: float | None
     live: bool = False
     unused: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     landmark_words: tuple[LandmarkWords, ...] = ()
 
     @abstractmethod
