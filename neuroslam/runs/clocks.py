@@ -16,6 +16,9 @@ from neuroslam.sensors.tracks import time_text
 _LEAST_CORRELATION = 0.3
 """Below it the turn rates do not agree."""
 
+_LEAST_DEVIATIONS = 4.0
+"""Of the correlation by chance, see :func:`_chance`: all offsets are tried, the best is taken."""
+
 _LEAST_OVERLAP = 0.5
 """Of the shorter recording, at the offsets that are tried."""
 
@@ -128,7 +131,8 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
         measured: Turning by the source of motion.
 
     Raises:
-        ValueError: If the best correlation is below 0.3, or another offset is nearly as good.
+        ValueError: If the best correlation is below 0.3 or within what chance gives, has the wrong
+            sign, or another offset is nearly as good.
 
     Example:
         >>> t = np.arange(0.0, 30.0, 0.1)
@@ -151,12 +155,18 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
     best = int(np.argmax(score))
     apart_s = float(starts[0] - starts[1])
     coarse_s = apart_s + float(lags[best]) * step_s
-    if correlation[best] < _LEAST_CORRELATION:
-        negative = float(np.where(enough, correlation, 0.0).min())
-        sign = " (positive is to the left: check the sign)" if negative < -0.5 else ""
+    chance = _chance(*rates, int(common[best]))
+    reversed_at = int(np.argmin(np.where(enough, correlation * np.sqrt(common), np.inf)))
+    if -correlation[reversed_at] > max(1.2 * correlation[best], _LEAST_DEVIATIONS * chance):
         raise ValueError(
-            f"the turn rates of camera and motion do not agree at any offset: they correlate by "
-            f"{correlation[best]:.2f} at best, expected {_LEAST_CORRELATION}{sign}"
+            f"the turn rates of camera and motion correlate by {correlation[reversed_at]:.2f}, so "
+            "one has the wrong sign; expected positive turn rates to the left"
+        )
+    least = max(_LEAST_CORRELATION, _LEAST_DEVIATIONS * chance)
+    if correlation[best] < least:
+        raise ValueError(
+            "the turn rates of camera and motion do not agree at any offset: they correlate by "
+            f"{correlation[best]:.2f} at best, expected {least:.2f} or more for so short a time"
         )
     others = np.where(np.abs(lags - lags[best]) * step_s > _APART_S, score, -np.inf)
     second = int(np.argmax(others))
@@ -189,6 +199,22 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     together = summed(a, b) - sum_a * sum_b / n
     correlation = np.where(scale > least, together / np.maximum(scale, least), 0.0)
     return np.arange(len(n)) - (len(b) - 1), correlation, n
+
+
+def _chance(a: np.ndarray, b: np.ndarray, n: int) -> float:
+    r"""Return the standard deviation of the correlation of two unrelated series, by their memory.
+
+    .. math:: \sigma^2 = \frac1n \sum_k \rho_a(k) \rho_b(k)
+
+    M. S. Bartlett, "Some aspects of the time-correlation problem", J. Royal Stat. Soc. 98, 1935.
+    """
+    memory = []
+    for x in (a - a.mean(), b - b.mean()):
+        full = fftconvolve(x, x[::-1])[len(x) - 1 :]
+        memory.append(full / full[0])
+    length = min(len(a), len(b)) // 4
+    both = memory[0][:length] * memory[1][:length]
+    return math.sqrt(max(1.0, 2.0 * float(both.sum()) - 1.0) / n)
 
 
 def _correlation_at(seen: Turns, measured: Turns, offset_s: float) -> float:

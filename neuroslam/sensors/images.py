@@ -104,7 +104,9 @@ class ImageSource(IndexedSource):
             times_s = motion.times_s if times_s is None else times_s
         if times_s is None and (stamped := times_of_names([_stem(i.name) for i in images])):
             times_s, unit = stamped
-            self.notes += (f"{name}: the names of the images are their times, in {UNIT_NAMES[unit]}",)
+            self.notes += (
+                f"{name}: the names of the images are their times, in {UNIT_NAMES[unit]}",
+            )
         if times_s is not None:
             self._require_one_each(len(times_s), "times")
         self.clock = Clock(name, times_s, frame_rate_hz)

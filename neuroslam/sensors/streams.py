@@ -150,7 +150,8 @@ class Streams(Source):
             for source, (low, high) in zip((self.camera, self.motion), spans, strict=True)
         )
         return SourceError(
-            f"{' and '.join(runs)}; expected an overlap; check that both use one clock"
+            f"{' and '.join(runs)}; expected an overlap; check that both use one clock, or give "
+            "--offset S, the seconds to add to the times of the motion, or --offset auto"
         )
 
 

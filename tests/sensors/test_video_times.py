@@ -59,9 +59,7 @@ def with_times(path, pts_ms):
     def elst(_):
         return struct.pack(">IIIiI", 0, 1, 2**31 - 1, 0, 0x10000)
 
-    path.write_bytes(
-        rewritten(path.read_bytes(), {b"stts": lambda _: stts, b"elst": elst})
-    )
+    path.write_bytes(rewritten(path.read_bytes(), {b"stts": lambda _: stts, b"elst": elst}))
     return path
 
 
@@ -132,7 +130,9 @@ def test_the_given_videos_of_variable_rate_have_the_times_of_their_list(name, sh
     np.testing.assert_allclose(seen_ms, inside, atol=1e-6)
 
 
-@pytest.mark.parametrize(("name", "code"), [("a.avi", "MJPG"), ("a.mp4", "mp4v"), ("a.mkv", "MJPG")])
+@pytest.mark.parametrize(
+    ("name", "code"), [("a.avi", "MJPG"), ("a.mp4", "mp4v"), ("a.mkv", "MJPG")]
+)
 def test_a_video_of_constant_rate_has_the_multiples_of_its_period(name, code, tmp_path):
     source = open_source(film(tmp_path / name, 12, 12.5, code))
     assert [frame.time_s for frame in source] == [k / 12.5 for k in range(12)]
