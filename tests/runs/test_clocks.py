@@ -88,7 +88,7 @@ def test_a_real_cars_video_and_its_motion_by_another_clock_are_aligned(shared, t
 
 
 def test_a_run_with_an_offset_pairs_images_and_motion_and_can_be_read_again(drive, tmp_path, call):
-    home, true_s = drive
+    home, _ = drive
     done = call("run", pair(home), "--offset", "auto", "-o", tmp_path, "--no-tensorboard")
     assert (done.code, done.err) == (0, "")
     assert "added to the times of the motion; the turn rates correlate by 0.9" in done.out

@@ -64,5 +64,5 @@ def test_axes_of_a_camera_are_noticed_and_those_of_a_robot_or_a_drone_are_not():
 
 @pytest.mark.parametrize("text", ["", "xy", "x,x", "z,-z", "forward", "x,y,z"])
 def test_unknown_axes_are_one_line(text):
-    with pytest.raises(SourceError, match="expected robot .x ahead, y left., camera"):
+    with pytest.raises(SourceError, match=r"expected robot .x ahead, y left., camera"):
         parse_axes(text)

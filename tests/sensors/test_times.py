@@ -1,4 +1,4 @@
-"""Times of tables, lists and file names: the column, the unit, the order; what is not recognised."""
+"""Times of tables, lists and file names: column, unit and order; those not recognised."""
 
 import math
 
@@ -75,8 +75,9 @@ def times(source):
     ],
 )
 def test_a_motion_table_has_its_times_under_any_usual_name(header, factor, word, tmp_path):
-    path = table(tmp_path / "m.csv", f"{header},v_m_s,w_rad_s", [k * factor // 10 for k in range(0, 40, 4)]
-                 if factor > 1 else [0.4 * k for k in range(10)])  # fmt: skip
+    ticks = range(0, 40, 4)  # tenths of a second
+    stamps = [k * factor // 10 if factor > 1 else k / 10 for k in ticks]
+    path = table(tmp_path / "m.csv", f"{header},v_m_s,w_rad_s", stamps)
     source = open_source(path)
     np.testing.assert_allclose(times(source), 0.4 * np.arange(10), atol=1e-9)
     assert len(source.notes) == (word is not None)
