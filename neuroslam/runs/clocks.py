@@ -25,6 +25,9 @@ _LEAST_OVERLAP = 0.5
 _SECOND_BEST = 0.95
 """Another offset whose score is above this share of the best makes the offset ambiguous."""
 
+_MOST_SAMPLES = 2_000_000
+"""More than a day at 20 Hz: a longer span is a wrong time."""
+
 _APART_S = 1.0
 """Offsets nearer than this to each other are one."""
 
@@ -143,6 +146,12 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
     step_s = float(np.clip(np.median(np.diff(seen.times_s)), 0.02, 0.2))
     rates, starts = [], []
     for turns in (seen, measured):
+        span_s = turns.times_s[-1] - turns.times_s[0]
+        if span_s > _MOST_SAMPLES * step_s:
+            raise ValueError(
+                f"the times of one of the two span {time_text(float(span_s))}, expected at most "
+                f"{time_text(_MOST_SAMPLES * step_s)}"
+            )
         grid = np.arange(turns.times_s[0], turns.times_s[-1], step_s)
         heading = np.concatenate([[0.0], np.cumsum(turns.turned_rad)])
         rates.append(np.diff(np.interp(grid, turns.times_s, heading)))
@@ -155,7 +164,7 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
     best = int(np.argmax(score))
     apart_s = float(starts[0] - starts[1])
     coarse_s = apart_s + float(lags[best]) * step_s
-    chance = _chance(*rates, int(common[best]))
+    chance = _chance(rates[0], rates[1], int(common[best]))
     reversed_at = int(np.argmin(np.where(enough, correlation * np.sqrt(common), np.inf)))
     if -correlation[reversed_at] > max(1.2 * correlation[best], _LEAST_DEVIATIONS * chance):
         raise ValueError(

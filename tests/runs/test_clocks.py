@@ -148,6 +148,13 @@ def test_laps_that_are_all_alike_have_no_single_offset():
         best_offset(Turns(times_s, turned), Turns(times_s, turned))
 
 
+def test_one_wrong_time_takes_no_memory():
+    times_s, turned = np.arange(N) / RATE_HZ, turn_rates(0)[1:]
+    wrong = Turns(np.append(times_s[:-1], 1e12), turned)
+    with pytest.raises(ValueError, match=r"span 1000000000000 s, expected at most 100000 s"):
+        best_offset(Turns(times_s, turned), wrong)
+
+
 @pytest.mark.parametrize(
     ("offset", "words"),
     [("soon", "expected a number of seconds, or auto"), ("inf", "expected a number of seconds")],
