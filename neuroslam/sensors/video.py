@@ -85,7 +85,7 @@ class VideoSource(Source):
                     success = capture.grab()
                 if not success:
                     break
-                time_s = self._time_s(capture, index)
+                time_s = self._time_s(capture, index, latest_s)
                 try:
                     if not time_s > latest_s:
                         raise BadFrame(
@@ -113,12 +113,18 @@ class VideoSource(Source):
                 raise fault
             on_bad_frame(fault)
 
-    def _time_s(self, capture: cv2.VideoCapture, index: int) -> float:
-        """Return the presentation time of the frame that was grabbed last."""
+    def _time_s(self, capture: cv2.VideoCapture, index: int, latest_s: float) -> float:
+        """Return the presentation time of the frame that was grabbed last.
+
+        OpenCV gives 0 for a frame without one, such as the last of an MPEG program stream: it is
+        one period after the frame before it.
+        """
         regular_s = index / self._rate_hz
         if not self._has_times:
             return regular_s
         time_s = _presented_s(capture)
+        if time_s == 0.0 and index > 0:
+            time_s = latest_s + 1.0 / self._rate_hz
         return regular_s if abs(time_s - regular_s) <= _ROUNDING_S else time_s
 
     def _missing(self, n_frames: int, latest_s: float) -> str:

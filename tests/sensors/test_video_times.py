@@ -138,6 +138,24 @@ def test_a_video_of_constant_rate_has_the_multiples_of_its_period(name, code, tm
     assert [frame.time_s for frame in source] == [k / 12.5 for k in range(12)]
 
 
+@pytest.mark.parametrize(
+    ("name", "code"), [("a.mpg", "PIM1"), ("a.wmv", "WMV2"), ("a.3gp", "mp4v")]
+)
+def test_a_frame_without_a_presentation_time_follows_the_one_before_it(name, code, tmp_path):
+    times = [frame.time_s for frame in open_source(film(tmp_path / name, 30, 25.0, code))]
+    np.testing.assert_allclose(
+        times, np.arange(30) / 25.0, atol=1e-9
+    )  # an .mpg has none at its end
+
+
+def test_a_raw_stream_without_times_has_the_rate_of_its_decoder(tmp_path):
+    images = [np.full((48, 64), 20 * k, np.uint8) for k in range(5)]
+    data = b"".join(cv2.imencode(".jpg", image)[1].tobytes() for image in images)
+    (tmp_path / "a.mjpeg").write_bytes(data)
+    source = open_source(tmp_path / "a.mjpeg")
+    assert [frame.time_s for frame in source] == [k / source.frame_rate_hz for k in range(5)]
+
+
 @pytest.mark.parametrize("version", [0, 1])
 def test_an_edit_list_ends_a_video_without_an_error(version, tmp_path):
     path = with_edit(film(tmp_path / "a.mp4", 30, 10.0), 0.0, 2.0, version)
