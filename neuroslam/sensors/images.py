@@ -424,15 +424,20 @@ def is_image_name(name: str) -> bool:
     return base.lower().endswith(IMAGE_SUFFIXES) and not base.startswith(".")
 
 
-def natural_key(name: str) -> tuple[list[int | str], str]:
-    """Return a sort key that compares the numbers in names as numbers.
+def natural_key(name: str) -> tuple[list[float | str], str]:
+    """Return a sort key that compares the numbers in names as numbers, Unix times as decimals.
 
     Example:
         >>> sorted(["10.jpg", "2.jpg", "a.jpg"], key=natural_key)
         ['2.jpg', '10.jpg', 'a.jpg']
+        >>> sorted(["map.jpg", "1700000000.5.jpg", "1700000000.25.jpg"], key=natural_key)
+        ['1700000000.25.jpg', '1700000000.5.jpg', 'map.jpg']
     """
-    parts = re.split(r"(\d+)", name)
-    return [int(part) if part.isdecimal() else part.lower() for part in parts], name
+    parts = re.split(r"(\d{9,10}\.\d+|\d+)", name)
+    numbers = [float(part) if "." in part else int(part) for part in parts[1::2]]
+    key: list[float | str] = [part.lower() for part in parts]
+    key[1::2] = numbers
+    return key, name
 
 
 def read_text(path: Path) -> str:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.geometry import wrap_angles
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.times import (
@@ -236,7 +236,8 @@ def parse_table(
         needed: Required columns.
         expected: Description of the expected columns, for messages.
         optional: Optional columns.
-        together: Optional columns that are complete or absent.
+        together: Optional columns that are complete or absent; a field that is no number is NaN,
+            with a note.
         aliases: Name of the column for each other name that it may have, in lower case.
         on_bad_row: Called with the fault of each row that cannot be read, which is then left out;
             ``None``: the fault is raised.
@@ -272,27 +273,41 @@ def parse_table(
     if with_time and time is None:
         _require_no_times(header, columns, [row for _, row in numbered], wanted, name)
     numbers = [columns.index(field) for field in wanted]
-    values, rows = [], []
+    values, rows, lost = [], [], []
     for line, row in numbered:
         try:
             if len(row) != len(columns):
                 raise SourceError(
                     f"{name}: line {line} has {len(row)} values; expected {len(columns)}"
                 )
-            values.append([
-                _number(row[number], name, line, column, column == "time_s")
-                for column, number in zip(wanted, numbers, strict=True)
-            ] + [math.nan if time is None or time.rest is None
-                 else _number(row[time.rest], name, line, header[time.rest])])  # fmt: skip
+            found = []
+            for column, number in zip(wanted, numbers, strict=True):
+                try:
+                    found.append(_number(row[number], name, line, column, column == "time_s"))
+                except SourceError as fault:
+                    if column not in together:
+                        raise
+                    found.append(math.nan)
+                    lost.append(str(fault))
+            if time is not None and time.rest is not None:
+                found.append(_number(row[time.rest], name, line, header[time.rest]))
+            values.append(found)
             rows.append(f"line {line}")
         except SourceError as fault:
             if on_bad_row is None:
                 raise
             on_bad_row(str(fault))
-    array, notes = np.array(values).reshape(-1, len(wanted) + 1), ()
-    table, rest = dict(zip(wanted, array.T[:-1], strict=True)), array[:, -1]
+    array = np.array(values, dtype=np.float64).reshape(len(values), -1)
+    table = dict(zip(wanted, array.T, strict=False)) if len(values) else {
+        field: np.zeros(0) for field in wanted
+    }  # fmt: skip
+    notes: tuple[str, ...] = ()
+    if lost:
+        notes = (f"{counted(len(lost), 'field')} of truth cannot be read, the first: {lost[0]}",)
     if time is not None:
-        table["time_s"], notes = _as_seconds(table["time_s"], rest, time, name)
+        rest = array[:, -1] if time.rest is not None and len(values) else None
+        table["time_s"], told = _as_seconds(table["time_s"], rest, time, name)
+        notes = (*told, *notes)
     return Table(table, rows, notes)
 
 
@@ -335,12 +350,12 @@ def _require_no_times(
 
 
 def _as_seconds(
-    values: np.ndarray, rest: np.ndarray, column: TimeColumn, name: str
+    values: np.ndarray, rest: np.ndarray | None, column: TimeColumn, name: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Convert a time column to seconds, and say how, unless it is ``time_s`` in seconds."""
     whole = bool((values == np.floor(values)).all())
-    if column.rest is not None and whole and bool(((rest >= 0) & (rest < 1e9)).all()):
-        note = f"{name}: times are columns {column.index + 1} and {column.rest + 1}"
+    if rest is not None and whole and bool(((rest >= 0) & (rest < 1e9)).all()):
+        note = f"{name}: times are columns {column.index + 1} and {(column.rest or 0) + 1}"
         return values + rest / 1e9, (f"{note}, in seconds and nanoseconds",)
     times_s, unit = in_seconds(values, column.unit)
     if column.name.lower() == "time_s" and unit == "s":

@@ -172,6 +172,17 @@ def test_a_table_without_times_says_what_rate_is_assumed(header, tmp_path):
     assert source.notes == (f"{tmp_path}/m.csv: has no times; 10 frames per second assumed",)
 
 
+def test_a_lost_field_of_truth_costs_the_truth_of_that_row(tmp_path):
+    path = tmp_path / "m.csv"
+    rows = [f"{k / 10},1,0,{k},0,0" for k in range(5)]
+    rows[2] = "0.2,1,0,lost,0,0"
+    path.write_text("\n".join(["time_s,v_m_s,w_rad_s,x_m,y_m,theta_rad", *rows]))
+    source = open_source(path)
+    assert [frame.index for frame in source if frame.truth is None] == [2]
+    assert "1 field of truth cannot be read, the first: " in source.notes[0]
+    assert "line 4: x_m is 'lost'" in source.notes[0]
+
+
 def test_time_s_comes_before_other_columns_of_time():
     header = ["stamp", "time_ms", "time_s", "v_m_s"]
     assert time_column(header).index == 2
@@ -248,6 +259,12 @@ def test_a_folder_of_time_names_beginning_at_zero_is_in_order(tmp_path):
     source = open_source(images(tmp_path / "f", names))
     assert [file.name for file in source.images] == names
     assert times(source) == [k / 20 for k in range(7)]  # small numbers may be anything
+
+
+def test_a_file_of_another_name_does_not_change_the_order(tmp_path):
+    names = ["1700000000.25.png", "1700000000.5.png", "1700000001.0.png", "map.png"]
+    source = open_source(images(tmp_path / "f", names[::-1]))
+    assert [file.name for file in source.images] == names
 
 
 def test_counters_with_points_stay_in_natural_order(tmp_path):
