@@ -1,5 +1,8 @@
 """The semantic map: an associative memory in neurons from landmarks to positions."""
 
+from typing import cast
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,11 +12,13 @@ from neuroslam.spiking.ensemble import (
     Tuning,
     lowpass,
     rates,
+    replace,
     sample_tuning,
     solve_decoders,
     synapse,
+    view,
 )
-from neuroslam.spiking.learning import pes_step, voja_step
+from neuroslam.spiking.learning import memorise, pes_step, voja_step
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
@@ -83,6 +88,7 @@ class AssociativeMap(BufferModule):
         super().__init__()
         self.config = config
         self.time_step_s = time_step_s
+        self._rates: np.ndarray | None = None  # constants of compiled steps
         draw = torch.Generator().manual_seed(seed)
         n = config.neurons
         near = None
@@ -123,6 +129,16 @@ class AssociativeMap(BufferModule):
             The recall, filtered, ``(batch, n_value)``.
         """
         c, dt = self.config, self.time_step_s
+        inputs = key, value, seen, *(part for part in (plasticity, voja) if part is not None)
+        state = self.encoders, self.decoders, self.rule, self.recalled, self.taught
+        if self.memory.runs_compiled(*inputs, *state):
+            numbers = [part.to(key).contiguous().numpy() for part in inputs[2:]]
+            learns = np.ones_like(numbers[0]) if plasticity is None else numbers[1]
+            moves = numbers[0] if voja is None else numbers[-1]
+            recall = self.advance(
+                key.contiguous().numpy(), value.contiguous().numpy(), numbers[0], learns, moves
+            )
+            return torch.from_numpy(recall)
         # In this order; the other one takes seven times as long.
         current = self.memory.bias + torch.bmm(key.unsqueeze(1), self.encoders.mT).squeeze(1)
         spikes = self.memory.fire((self.memory.charged * (1.0 - current)).unsqueeze(0))[0]
@@ -145,6 +161,57 @@ class AssociativeMap(BufferModule):
         self.taught = lowpass(self.taught, value, synapse(_TAU_TEACHER_S, dt))
         self.rule = lowpass(self.rule, error_now, kept)
         return self.recalled
+
+    def advance(
+        self,
+        key: np.ndarray,
+        value: np.ndarray,
+        seen: np.ndarray,
+        plasticity: np.ndarray,
+        voja: np.ndarray,
+    ) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arguments are its own."""
+        modules = self._modules
+        memory, error = (cast(NeuronArray, modules[name]) for name in ("memory", "error"))
+        encoders, recalled = view(self, "encoders"), view(self, "recalled")
+        rates = self._rates
+        if rates is None or rates.dtype != recalled.dtype:
+            rates = self._rates = self._constants(recalled.dtype)
+        # A large product: that of torch is quicker than a loop, and adds in an order of its own.
+        weights = cast(Tensor, self._buffers["encoders"])
+        said = torch.bmm(torch.from_numpy(key).unsqueeze(1), weights.mT).squeeze(1).numpy()
+        drive = rates[6] * (rates[7] - view(memory, "bias") - said)
+        spikes = memory.fire_compiled(drive[None])[0]
+        relayed, taught, rule = (view(self, n) for n in ("relayed", "taught", "rule"))
+        silenced = rates[8] * (rates[7] - seen)
+        error_decoders = view(self, "error_decoders")
+        error_now = error.respond((relayed - taught)[None], error_decoders, silenced)[0]
+        passed = recalled
+        if self.config.relay:
+            passed = self.relay.respond(passed[None], view(self, "relay_decoders"))[0]
+        after = tuple(np.empty_like(rule) for _ in range(4))
+        memorise(
+            spikes, key, plasticity, voja, view(self, "gain"), encoders, view(self, "decoders"),
+            view(self, "activity_hz"), (rule, recalled, relayed, taught),
+            (error_now, passed, value), rates, (*after, np.empty_like(rule[0])),
+        )  # fmt: skip
+        rule, recalled, relayed, taught = after
+        replace(self, rule=rule, recalled=recalled, relayed=relayed, taught=taught)
+        return recalled
+
+    def _constants(self, kind: np.dtype) -> np.ndarray:
+        """Return the rates of ``memorise``, and those of the drive."""
+        c, dt = self.config, self.time_step_s
+        numbers = [
+            1.0 / dt,
+            c.pes_rate * dt / c.neurons,
+            c.voja_rate,
+            *(synapse(tau, dt) for tau in (_TAU_RECALL_S, _TAU_ERROR_S, _TAU_TEACHER_S)),
+            self.memory.charged,
+            1.0,
+            self.error.charged * _INHIBITION,
+        ]
+        return np.array(numbers, dtype=kind)
 
     def error_output(self, seen: Tensor) -> Tensor:
         """Step the neurons of the error; return their unfiltered output, ``(batch, n_value)``."""

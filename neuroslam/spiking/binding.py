@@ -2,11 +2,20 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    lowpass,
+    replace,
+    sample_tuning,
+    synapse,
+    view,
+)
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 1000
@@ -61,7 +70,7 @@ class SpikingBinding(BufferModule):
         tuning = tuning._replace(encoders=tuning.encoders.sign())
         self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
         points = torch.linspace(-_RADIUS, _RADIUS, _SOLVER_POINTS).expand(groups, -1).unsqueeze(-1)
-        decoders = solve_decoders(self.neurons.rates(points), points.square(), noise=0.01)
+        decoders = self.neurons.solve(points, points.square(), noise=0.01)
         self.register_buffer("decoders", (decoders / time_step_s).mT.contiguous())
         self.register_buffer("product", torch.zeros(batch, n_frequencies, 2))
 
@@ -77,6 +86,12 @@ class SpikingBinding(BufferModule):
             a: Complex, ``(batch, n_frequencies)``, parts in [-1, 1].
             b: The same.
         """
+        if self.neurons.runs_compiled(a, b, self.product, self.decoders):
+            left, right = (
+                torch.view_as_real(z.resolve_conj()).to(self.product).contiguous().numpy()
+                for z in (a, b)
+            )
+            return torch.view_as_complex(torch.from_numpy(self.advance(left, right)))
         # Rows: real·real, imaginary·imaginary, real·imaginary, imaginary·real.
         left = torch.stack([a.real, a.imag, a.real, a.imag])
         right = torch.stack([b.real, b.imag, b.imag, b.real])
@@ -88,3 +103,42 @@ class SpikingBinding(BufferModule):
         product = torch.stack([rr - ii, ri + ir], dim=-1).transpose(0, 1)
         self.product = lowpass(self.product, product, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.product)
+
+    def advance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
+        decoders = view(self, "decoders").reshape(8 * a.shape[1], -1, 1)
+        x = np.empty((len(decoders), len(a), 1), dtype=a.dtype)
+        sums_and_differences(a, b, x)
+        squares = self.neurons.respond(x, decoders)
+        before, kept = view(self, "product"), synapse(TAU_S, self.time_step_s)
+        product = np.empty_like(before)
+        products_of(squares, before, kept, product)
+        replace(self, product=product)
+        return product
+
+
+@compiled
+def sums_and_differences(a: np.ndarray, b: np.ndarray, x: np.ndarray) -> None:
+    """Write what the populations square into ``x``, ``(8 n_frequencies, batch, 1)``."""
+    batch, n = a.shape[0], a.shape[1]
+    for i in range(batch):
+        for k in range(n):
+            for row in range(4):
+                left = a[i, k, row % 2] / _RADIUS
+                right = b[i, k, (row + row // 2) % 2] / _RADIUS
+                x[row * n + k, i, 0] = left + right
+                x[(4 + row) * n + k, i, 0] = left - right
+
+
+@compiled
+def products_of(squares: np.ndarray, before: np.ndarray, kept: float, product: np.ndarray) -> None:
+    """Write the filtered products, as those before ``(batch, n_frequencies, 2)``."""
+    batch, n = before.shape[0], before.shape[1]
+    for i in range(batch):
+        for k in range(n):
+            rr = 0.5 * (squares[k, i, 0] - squares[4 * n + k, i, 0])
+            ii = 0.5 * (squares[n + k, i, 0] - squares[5 * n + k, i, 0])
+            ri = 0.5 * (squares[2 * n + k, i, 0] - squares[6 * n + k, i, 0])
+            ir = 0.5 * (squares[3 * n + k, i, 0] - squares[7 * n + k, i, 0])
+            product[i, k, 0] = (rr - ii) + kept * (before[i, k, 0] - (rr - ii))
+            product[i, k, 1] = (ri + ir) + kept * (before[i, k, 1] - (ri + ir))

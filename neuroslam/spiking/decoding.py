@@ -1,19 +1,24 @@
 """Decoding of positions from vectors: search and refinement, a network, a probability."""
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.vector_steps import (
+    CANDIDATES,
+    LEAST_CURVATURE,
+    REFINEMENTS,
+    SpaceTables,
+    fourier_tables,
+)
 
 _STEP_RAD = 1.25  # phase of the shortest wave between two points of the coarse search
 _MOST_POINTS = 20_000
-_CANDIDATES = 4
-_REFINEMENTS = 6
-_LEAST_CURVATURE = 0.02  # least curvature of a wave, as a share of one in phase
 
 
 class Decoded(NamedTuple):
@@ -59,6 +64,7 @@ class PositionDecoder:
     def __init__(self, space: SSPSpace) -> None:
         self.space = space
         self._waves: Tensor | None = None
+        self._tables: tuple[Tensor, Tensor, tuple[object, ...], SpaceTables] | None = None
 
     def __call__(self, z: Tensor) -> Decoded:
         """Decode Fourier coefficients, complex, ``(..., n_frequencies)``.
@@ -74,10 +80,10 @@ class PositionDecoder:
         lead, z = z.shape[:-1], z.detach().reshape(-1, z.shape[-1])
         grid, cosines, sines = self._grid()
         coarse = z.real @ cosines + z.imag @ sines
-        best = coarse.topk(min(_CANDIDATES, len(grid)), dim=-1).indices
+        best = coarse.topk(min(CANDIDATES, len(grid)), dim=-1).indices
         each = z.unsqueeze(1)
         at = grid[best]
-        for _ in range(_REFINEMENTS):
+        for _ in range(REFINEMENTS):
             at = self.track(each, at)
         similarity = self.similarity(each, at)
         first = similarity.argmax(-1, keepdim=True)
@@ -106,7 +112,7 @@ class PositionDecoder:
         start = start_m.detach()
         here, ahead = agreement(self.space, z, start)
         outer = (waves.unsqueeze(-1) * waves.unsqueeze(-2)).flatten(-2)
-        curvature = here.clamp_min(_LEAST_CURVATURE) @ outer
+        curvature = here.clamp_min(LEAST_CURVATURE) @ outer
         curvature = curvature.detach().unflatten(-1, (m, m))
         up = (ahead @ waves).unsqueeze(-1)
         step = torch.linalg.solve_ex(curvature, up).result.squeeze(-1)
@@ -115,11 +121,44 @@ class PositionDecoder:
         position = start + torch.clamp(step, -longest, longest)
         return torch.clamp(position, low, high)
 
+    def tables(self) -> SpaceTables:
+        """Return what compiled steps take of the space, on the CPU; renewed with it."""
+        own = self.space._parameters
+        frequencies, scale = cast(Tensor, own["frequencies"]), cast(Tensor, own["length_scale_m"])
+        versions = _version(frequencies), _version(scale)
+        known = self._tables
+        if (
+            known is None
+            or known[0] is not frequencies
+            or known[1] is not scale
+            or known[2] != versions
+        ):
+            points, cosines, sines = self._grid()
+            waves, modules = cast(Tensor, self._waves), self.space.grid_modules
+            longest = 1.0 / waves.abs().amax(0)
+            tables = SpaceTables(
+                waves.numpy(),
+                self.space.bounds_m.contiguous().numpy(),
+                longest.numpy(),
+                np.zeros((0, 0), dtype=np.int64) if modules is None else modules.numpy(),
+                points.contiguous().numpy(),
+                cosines.contiguous().numpy(),
+                sines.contiguous().numpy(),
+                *fourier_tables(self.space.n_features, waves.numpy().dtype),
+            )
+            known = self._tables = frequencies, scale, versions, tables
+        return known[3]
+
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the points of the coarse search and the waves at them; renewed with the space."""
         waves = self.space.wave_vectors.detach()
         known = self._waves
-        if known is None or known.device != waves.device or not torch.equal(known, waves):
+        if (
+            known is None
+            or known.device != waves.device
+            or known.dtype != waves.dtype
+            or not torch.equal(known, waves)
+        ):
             low, high = self.space.bounds_m.T
             each = ((high - low) * waves.abs().amax(0) / _STEP_RAD).ceil() + 1
             each = (each * min(1.0, (_MOST_POINTS / float(each.prod())) ** (1 / len(each)))).long()
@@ -131,6 +170,11 @@ class PositionDecoder:
             angle = points @ waves.T
             self._points, self._waves = (points, angle.cos().T, angle.sin().T), waves.clone()
         return self._points
+
+
+def _version(tensor: Tensor) -> tuple[int, int]:
+    """Return where a tensor's numbers are, and how often they were changed in place."""
+    return tensor.data_ptr(), 0 if tensor.is_inference() else tensor._version
 
 
 class LearnedDecoder(nn.Module):

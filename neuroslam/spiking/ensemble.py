@@ -1,17 +1,22 @@
 """Populations of neurons that represent vectors: tuning, decoders, synapses (NEF)."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.neurons import (
     LIFState,
     Membrane,
+    fire_row,
+    lif_constants,
     lif_rate,
     lif_step,
+    respond,
     resting,
     stepped_lif,
     stepped_lif_rate,
@@ -138,6 +143,68 @@ def lowpass(filtered: Tensor, value: Tensor, kept: float) -> Tensor:
     return torch.lerp(value, filtered, kept)
 
 
+class _Views(dict[str, tuple[Tensor, np.ndarray]]):
+    """Arrays that share the memory of buffers; a copy of the module makes its own."""
+
+    def __deepcopy__(self, memo: object) -> "_Views":
+        return _Views()
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return _Views, ()
+
+
+def view(module: BufferModule, name: str) -> np.ndarray:
+    """Return a buffer as an array that shares its memory, for compiled steps."""
+    buffer = module._buffers[name]
+    views = module.__dict__.get("_views")
+    if views is None:
+        views = module.__dict__["_views"] = _Views()
+    known = views.get(name)
+    if known is not None and known[0] is buffer:
+        return known[1]
+    assert buffer is not None
+    if not buffer.is_contiguous():
+        module._buffers[name] = buffer = buffer.contiguous()
+    array = buffer.numpy()
+    views[name] = buffer, array
+    return array
+
+
+def replace(module: BufferModule, **arrays: np.ndarray) -> None:
+    """Set buffers to arrays."""
+    views = module.__dict__.get("_views")
+    if views is None:
+        views = module.__dict__["_views"] = _Views()
+    for name, array in arrays.items():
+        module._buffers[name] = buffer = torch.from_numpy(array)
+        views[name] = buffer, array
+
+
+def may_share(module: BufferModule, *names: str) -> bool:
+    """Return whether compiled steps may take these buffers; quick for those that they have set."""
+    views = module.__dict__.get("_views") or {}
+    for name in names:
+        buffer, known = cast(Tensor, module._buffers[name]), views.get(name)
+        shared = known is not None and known[0] is buffer and not buffer.requires_grad
+        if not shared and not runs_compiled(buffer):
+            return False
+    return True
+
+
+def filtered(before: np.ndarray, value: np.ndarray, kept: float) -> np.ndarray:
+    """Filter coefficients, ``(batch, n_frequencies, 2)``, as :func:`lowpass` does."""
+    after = np.empty_like(before)
+    filter_into(before.reshape(-1), value.reshape(-1), kept, after.reshape(-1))
+    return after
+
+
+@compiled
+def filter_into(before: np.ndarray, value: np.ndarray, kept: float, after: np.ndarray) -> None:
+    """Filter numbers into ``after``; :func:`lowpass` is the definition."""
+    for i in range(before.shape[0]):
+        after[i] = value[i] + kept * (before[i] - value[i])
+
+
 class NeuronArray(BufferModule):
     """Populations of the same size, side by side: currents in, spikes out.
 
@@ -187,6 +254,7 @@ class NeuronArray(BufferModule):
         self.register_buffer("deficit", state.deficit)
         self.register_buffer("asleep", state.asleep)
         self.register_buffer("spikes", torch.zeros_like(state.deficit), persistent=False)
+        self._folded: _Folded | None = None
 
     @property
     def charged(self) -> float:
@@ -205,6 +273,27 @@ class NeuronArray(BufferModule):
     def rates(self, x: Tensor) -> Tensor:
         """Return the rates under constant input, Hz; ``(groups, points, neurons)``."""
         return rates(self.currents(x), self.config, self.time_step_s)
+
+    def solve(self, points: Tensor, targets: Tensor, noise: float = 0.1) -> Tensor:
+        """Solve for decoders of a function, see :func:`solve_decoders`.
+
+        One group after the other: the rates of all groups at all points fill no cache.
+
+        Args:
+            points: ``(groups, n, dimensions)``.
+            targets: The function there, ``(groups, n, outputs)``.
+            noise: As a share of the highest rate.
+
+        Returns:
+            ``(groups, neurons, outputs)``.
+        """
+        solved = []
+        for g in range(len(points)):
+            own = slice(g, g + 1)
+            current = torch.baddbmm(self.bias[own, None], points[own], self.weights[own].mT)
+            activity = rates(current, self.config, self.time_step_s)
+            solved.append(solve_decoders(activity, targets[own], noise))
+        return torch.cat(solved)
 
     def forward(self, x: Tensor) -> Tensor:
         """Step with vectors as input, ``(groups, batch, dimensions)``."""
@@ -231,8 +320,10 @@ class NeuronArray(BufferModule):
             Spikes in this step, 0 or 1; of rates, how many are to be expected. Same shape.
         """
         model = self.config.model
-        if model in ("lif_rate", "relu"):
+        if self._has_rates:
             return rates(1.0 - drive / self.charged, self.config) * self.time_step_s
+        if self.runs_compiled(drive):
+            return torch.from_numpy(self.fire_compiled(drive.contiguous().numpy()).copy())
         step = lif_step if model == "lif" else stepped_lif
         state = LIFState(self.deficit, self.asleep)
         state, fired = step(state, drive, self.membrane, self.time_step_s)
@@ -240,7 +331,111 @@ class NeuronArray(BufferModule):
         self.spikes = fired
         return fired
 
+    @property
+    def _has_rates(self) -> bool:
+        return self.config.model in ("lif_rate", "relu")
+
+    def runs_compiled(self, *tensors: Tensor) -> bool:
+        """Return whether a compiled step may advance the neurons and take these tensors."""
+        weights = cast(Tensor, self._buffers["weights"])
+        return runs_compiled(weights, *tensors) and may_share(self, "deficit", "asleep")
+
+    def respond(
+        self, x: np.ndarray, decoders: np.ndarray, more: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Step with vectors as input, and decode, in one compiled pass.
+
+        The spikes of :meth:`forward` times the decoders. Rates are left to torch: all neurons have
+        one, so nothing is gained where few fire, and its logarithm is vectorised.
+
+        Args:
+            x: ``(groups, batch, dimensions)``.
+            decoders: ``(groups, neurons, outputs)``.
+            more: Added to the drive of an animal's neurons, ``(batch,)``; see :meth:`fire`.
+
+        Returns:
+            ``(groups, batch, outputs)``.
+        """
+        folded = self._constants()
+        deficit = view(self, "deficit")
+        groups, batch, n = deficit.shape
+        added = np.zeros(batch, dtype=deficit.dtype) if more is None else more
+        if x.shape != (groups, batch, folded.slopes.shape[1]) or decoders.shape[:2] != (groups, n):
+            raise ValueError(
+                f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
+                f"(groups, batch, neurons) = {deficit.shape}"
+            )
+        if self._has_rates:
+            more_t = torch.from_numpy(added).unsqueeze(-1)
+            drive = torch.from_numpy(folded.rest).unsqueeze(1) + more_t
+            drive = torch.baddbmm(drive, torch.from_numpy(x), torch.from_numpy(folded.slopes))
+            return torch.bmm(self.fire(drive), torch.from_numpy(decoders)).numpy()
+        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        decoded = np.empty((groups, batch, decoders.shape[2]), dtype=deficit.dtype)
+        respond(
+            x, added, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif,
+            decoded,
+        )  # fmt: skip
+        return decoded
+
+    def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
+        """Step as :meth:`fire` does, in one compiled pass."""
+        deficit = view(self, "deficit")
+        if drive.shape != deficit.shape:
+            raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
+        if self._has_rates:
+            return self.fire(torch.from_numpy(drive)).numpy()
+        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
+        now, owing, paused, fired = rows
+        fire_row(now, owing, paused, fired, self._constants().lif)
+        return spikes
+
+    def _spikes(self, deficit: np.ndarray) -> np.ndarray:
+        spikes = view(self, "spikes")
+        if spikes.shape != deficit.shape or spikes.dtype != deficit.dtype:
+            replace(self, spikes=np.zeros_like(deficit))  # of a state that was put in
+            spikes = view(self, "spikes")
+        return spikes
+
+    def _constants(self) -> "_Folded":
+        """Return what follows from weights and biases; renewed with them."""
+        weights, bias = self._buffers["weights"], self._buffers["bias"]
+        assert weights is not None
+        assert bias is not None
+        versions = _version(weights), _version(bias)
+        known = self._folded
+        if (
+            known is None
+            or known.weights is not weights
+            or known.bias is not bias
+            or known.versions != versions
+        ):
+            share = self.charged
+            slopes = (-share * weights).mT.contiguous().numpy()
+            rest = (share * (1.0 - bias)).contiguous().numpy()
+            stepped = self.config.model == "stepped_lif"
+            lif = lif_constants(self.membrane, self.time_step_s, stepped, rest.dtype)
+            self._folded = known = _Folded(weights, bias, versions, slopes, rest, lif)
+        return known
+
     def silence(self) -> None:
         """Reset all neurons to rest, at distance 1 from threshold."""
         self.deficit = torch.ones_like(self.deficit)
         self.asleep = torch.zeros_like(self.asleep)
+
+
+class _Folded(NamedTuple):
+    """What compiled steps take of neurons, and of which weights and biases it is made."""
+
+    weights: Tensor
+    bias: Tensor
+    versions: tuple[int, int]
+    slopes: np.ndarray
+    rest: np.ndarray
+    lif: np.ndarray
+
+
+def _version(tensor: Tensor) -> int:
+    """Return how often a tensor was changed in place; 0 where torch does not count."""
+    return 0 if tensor.is_inference() else tensor._version

@@ -1,7 +1,13 @@
 """Local rules by which populations learn: prescribed error sensitivity, and Voja's."""
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from neuroslam.compiled import compiled
+
+NOTHING = 1e-20
+"""Activity and change of a weight that compiled steps take for none."""
 
 
 def pes_step(decoders: Tensor, error: Tensor, activity: Tensor, rate: float) -> Tensor:
@@ -43,3 +49,77 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
     if torch.is_grad_enabled():
         encoders = encoders.clone()
     return encoders.index_put_((animal, neuron), rows)
+
+
+@compiled
+def memorise(
+    spikes: np.ndarray,
+    key: np.ndarray,
+    plasticity: np.ndarray,
+    voja: np.ndarray,
+    gain: np.ndarray,
+    encoders: np.ndarray,
+    decoders: np.ndarray,
+    activity: np.ndarray,
+    filters: tuple[np.ndarray, ...],
+    values: tuple[np.ndarray, ...],
+    rates: np.ndarray,
+    after: tuple[np.ndarray, ...],
+) -> None:
+    """Decode, learn in place, and filter, in one pass; ``AssociativeMap.forward`` defines it.
+
+    Its :func:`pes_step` is that of neurons that have been active, :func:`voja_step` of those that
+    fire.
+
+    Args:
+        spikes: In this step, ``(batch, neurons)``.
+        key: ``(batch, n_key)``.
+        plasticity: Share of the rate of learning, ``(batch,)``.
+        voja: The same of the encoders.
+        gain: Of the encoders, ``(neurons,)``.
+        encoders: ``(batch, neurons, n_key)``.
+        decoders: ``(batch, neurons, n_value)``.
+        activity: Filtered rates in Hz, ``(batch, neurons)``.
+        filters: ``rule``, ``recalled``, ``relayed`` and ``taught``, each ``(batch, n_value)``.
+        values: What goes into the first, and into the last two; the same shape.
+        rates: Rate of a spike in a step, rates of PES and Voja, and how much is kept of activity
+            and recall, of the rule and what is relayed, and of what is taught.
+        after: ``filters`` after the step, and room for one row of them; written.
+    """
+    batch, neurons, n_value = decoders.shape
+    n_key = encoders.shape[2]
+    per_spike, pes, move, recalls, errs, teaches = (
+        rates[0], rates[1], rates[2], rates[3], rates[4], rates[5],
+    )  # fmt: skip
+    rule, recalled, relayed, taught = filters
+    error_now, passed, value = values
+    new_rule, new_recalled, new_relayed, new_taught, wrong = after
+    for b in range(batch):
+        said, name = new_recalled[b], key[b]
+        largest, moves = 0.0, move * voja[b]
+        for o in range(n_value):
+            said[o] = 0.0
+            wrong[o] = pes * (plasticity[b] * rule[b, o])
+            largest = abs(wrong[o]) if abs(wrong[o]) > largest else largest
+        for i in range(neurons):
+            spike, row = spikes[b, i], decoders[b, i]
+            rate = spike * per_spike
+            activity[b, i] = rate + recalls * (activity[b, i] - rate)
+            if activity[b, i] < NOTHING:
+                activity[b, i] = 0.0
+            active = activity[b, i]
+            if spike != 0.0:
+                for o in range(n_value):
+                    said[o] += rate * row[o]
+            if active * largest > NOTHING:
+                for o in range(n_value):
+                    row[o] -= active * wrong[o]
+            if spike != 0.0 and moves != 0.0:
+                moved, far, mine = spike * moves, gain[i], encoders[b, i]
+                for j in range(n_key):
+                    mine[j] += moved * (far * name[j] - mine[j])
+        for o in range(n_value):
+            said[o] += recalls * (recalled[b, o] - said[o])
+            new_rule[b, o] = error_now[b, o] + errs * (rule[b, o] - error_now[b, o])
+            new_relayed[b, o] = passed[b, o] + errs * (relayed[b, o] - passed[b, o])
+            new_taught[b, o] = value[b, o] + teaches * (taught[b, o] - value[b, o])

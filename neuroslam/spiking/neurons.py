@@ -3,12 +3,17 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import leaky_relu, threshold
 
+from neuroslam.compiled import compiled
+
 LEAST_EXCESS = 1e-9
 """Current above threshold below which a rate is that of this much; keeps its logarithm finite."""
+
+_IN_CACHE = 512  # neurons that are advanced together
 
 
 class LIFState(NamedTuple):
@@ -139,3 +144,135 @@ def stepped_lif_rate(current: Tensor, membrane: Membrane, time_step_s: float) ->
     rise = torch.log1p(1.0 / excess) * (membrane.tau_rc_s / time_step_s)
     steps = round(membrane.tau_ref_s / time_step_s) + rise.floor() + 1.0
     return torch.where(current > 1.0, 1.0 / (time_step_s * steps), 0.0)
+
+
+def lif_constants(
+    membrane: Membrane, time_step_s: float, stepped: bool, dtype: np.dtype
+) -> np.ndarray:
+    """Return the numbers of :func:`fire_row`, of the type of its arrays.
+
+    With them it is :func:`lif_step`, or, if ``stepped``, :func:`stepped_lif`.
+
+    Example:
+        >>> lif_constants(Membrane(), 1e-3, True, np.dtype(np.float64))[4:].tolist()
+        [2.0, 0.0, 0.0, 0.0, 0.5, 1.0]
+    """
+    c, pause = membrane.keeps(time_step_s), membrane.tau_ref_s / time_step_s
+    if stepped:
+        numbers = (c, 0.0, 0.0, 1.0, float(round(pause)), 0.0, 0.0)
+    else:
+        whole = math.floor(pause + 1e-9)
+        part = math.exp((pause - whole) * time_step_s / membrane.tau_rc_s)
+        slope = c if part > 1.0 + 1e-9 else 1.0
+        numbers = (c, part, (1.0 - part) / (1.0 - c), slope, float(whole), -1.0, 1.0)
+    return np.array([*numbers, 0.0, 0.5, 1.0], dtype=dtype)
+
+
+@compiled
+def fire_row(
+    drive: np.ndarray,
+    deficit: np.ndarray,
+    asleep: np.ndarray,
+    spikes: np.ndarray,
+    constants: np.ndarray,
+) -> None:
+    """Advance neurons in place, arrays ``(neurons,)``; :func:`lif_step` is the definition.
+
+    Choices are between numbers, so that several neurons are advanced at once; all numbers have the
+    type of the arrays.
+    """
+    c, part, rest, slope, whole = (
+        constants[0], constants[1], constants[2], constants[3], constants[4],
+    )  # fmt: skip
+    low, high, zero, half, one = (
+        constants[5], constants[6], constants[7], constants[8], constants[9],
+    )  # fmt: skip
+    for i in range(drive.shape[0]):
+        d = drive[i]
+        charged = d + c * deficit[i]
+        a = asleep[i]
+        share = a if a > zero else zero
+        share = share if share < one else one
+        gap = one - charged
+        x = charged + share * gap if share < half else one - gap * (one - share)
+        fired = x < zero
+        early = rest + part * (x / d)
+        early = early if early > zero else early * slope
+        early = early if early > low else low
+        early = early if early < high else high
+        a = a - one
+        a = a if a > zero else zero
+        asleep[i] = a + (whole - early) if fired else a
+        x = x if x > zero else one
+        deficit[i] = x if x < one else one
+        spikes[i] = one if fired else zero
+
+
+@compiled
+def respond(
+    x: np.ndarray,
+    more: np.ndarray,
+    slopes: np.ndarray,
+    rest: np.ndarray,
+    deficit: np.ndarray,
+    asleep: np.ndarray,
+    spikes: np.ndarray,
+    decoders: np.ndarray,
+    constants: np.ndarray,
+    decoded: np.ndarray,
+) -> None:
+    """Encode, fire and decode in one pass; only neurons that fire are decoded.
+
+    Args:
+        x: Inputs, ``(groups, batch, dimensions)``.
+        more: Added to the drive of all neurons of an animal, ``(batch,)``.
+        slopes: Drive for each input, ``(groups, dimensions, neurons)``.
+        rest: Drive without any, ``(groups, neurons)``.
+        deficit: State, as the next two, ``(groups, batch, neurons)``.
+        asleep: The same.
+        spikes: The same; written alone.
+        decoders: ``(groups, neurons, outputs)``.
+        constants: See :func:`lif_constants`.
+        decoded: What the spikes say, ``(groups, batch, outputs)``; written.
+    """
+    groups, batch, n = deficit.shape
+    outputs = decoders.shape[2]
+    block = max(1, _IN_CACHE // n)  # rows that are advanced together
+    drive = np.empty(block * n, dtype=deficit.dtype)
+    who = np.empty(n + 1, dtype=np.int64)
+    owing, paused, fired = deficit.reshape(-1), asleep.reshape(-1), spikes.reshape(-1)
+    for first in range(0, groups * batch, block):
+        last = min(first + block, groups * batch)
+        for r in range(first, last):
+            g, b = r // batch, r % batch
+            own, base, added = drive[(r - first) * n : (r - first + 1) * n], rest[g], more[b]
+            for i in range(n):
+                own[i] = base[i] + added
+            for d in range(x.shape[2]):
+                value, slope = x[g, b, d], slopes[g, d]
+                for i in range(n):
+                    own[i] += value * slope[i]
+        part = slice(first * n, last * n)
+        fire_row(drive[: (last - first) * n], owing[part], paused[part], fired[part], constants)
+        for r in range(first, last):
+            g, b, m = r // batch, r % batch, 0
+            own, into = fired[r * n : (r + 1) * n], decoded[g, b]
+            for o in range(outputs):
+                into[o] = 0.0
+            for i in range(n):
+                who[m] = i
+                m += 1 if own[i] != 0.0 else 0
+            if outputs == 4:  # in registers
+                one, two, three, four = into[0], into[1], into[2], into[3]
+                for k in range(m):
+                    row = decoders[g, who[k]]
+                    one += row[0]
+                    two += row[1]
+                    three += row[2]
+                    four += row[3]
+                into[0], into[1], into[2], into[3] = one, two, three, four
+            else:
+                for k in range(m):
+                    row = decoders[g, who[k]]
+                    for o in range(outputs):
+                        into[o] += row[o]

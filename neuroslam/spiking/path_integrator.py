@@ -4,21 +4,39 @@ import math
 from abc import ABC, abstractmethod
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig, PathIntegratorConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.decoding import PositionDecoder
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    lowpass,
+    may_share,
+    replace,
+    sample_tuning,
+    synapse,
+    view,
+)
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.vector_steps import (
+    CLEARLY_BETTER,
+    COUPLINGS,
+    couple,
+    oscillators_after,
+    oscillators_before,
+    search,
+    similarity,
+    track,
+)
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
 _LOOK_S = 0.004  # time between two decodings of the position
-_REREAD_STEPS = 100  # steps between two decodings over the whole space
-_CLEARLY_BETTER = 0.05  # excess of similarity at which another position is taken
+REREAD_STEPS = 100  # steps between two decodings over the whole space
 
 
 def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilise: float) -> Tensor:
@@ -125,6 +143,17 @@ class Packet(BufferModule, ABC):
         self.register_buffer("position_m", torch.zeros(batch, space.dimension))
         self.register_buffer("age", torch.zeros((), dtype=torch.long))
 
+    @property
+    def coupling(self) -> int:
+        """Kind of the coupling, as its number in ``COUPLINGS``."""
+        c = self.config
+        return COUPLINGS.index(c.coupling) if c.coupling_gain else 0
+
+    @property
+    def look_steps(self) -> int:
+        """Number of steps between two decodings of the position nearby."""
+        return max(1, round(_LOOK_S / self.time_step_s))
+
     def _place(self, position_m: Tensor) -> None:
         self.position_m = position_m.detach().to(self.position_m).clone()
         self.age = torch.zeros_like(self.age)
@@ -138,15 +167,40 @@ class Packet(BufferModule, ABC):
         z = self.z
         position = self.position_m + self.time_step_s * velocity_m_s
         age = int(self.age) + 1
-        if age % max(1, round(_LOOK_S / self.time_step_s)) == 0:
+        if age % self.look_steps == 0:
             position = self.decoder.track(z, position)
-        if age % _REREAD_STEPS == 0:
+        if age % REREAD_STEPS == 0:
             best = self.decoder(z)
             here = self.decoder.similarity(z, position)
-            jumped = best.similarity > here + _CLEARLY_BETTER
+            jumped = best.similarity > here + CLEARLY_BETTER
             position = torch.where(jumped.unsqueeze(-1), best.position_m, position)
         self.position_m, self.age = position, self.age + 1
         return z
+
+    def locate_compiled(self, z: np.ndarray, position: np.ndarray) -> None:
+        """Count a step, and track positions in place as :meth:`locate` does.
+
+        Args:
+            z: ``(batch, n_frequencies, 2)``.
+            position: Integrated, ``(batch, dimension)``.
+        """
+        age = int(view(self, "age")) + 1
+        replace(self, age=np.array(age))
+        if age % self.look_steps == 0:
+            tables = self.decoder.tables()
+            for mine, x in zip(z, position, strict=True):
+                track(tables.waves, tables.bounds, tables.longest, mine, x)
+        if age % REREAD_STEPS == 0:
+            self.reread(z, position)
+
+    def reread(self, z: np.ndarray, position: np.ndarray) -> None:
+        """Decode positions over the whole space, in place; a jump must be clearly better."""
+        tables = self.decoder.tables()
+        for mine, x in zip(z, position, strict=True):
+            found = np.empty_like(x)
+            best = search(tuple(tables), mine, found)
+            if best > similarity(tables.waves, mine, x) + CLEARLY_BETTER:
+                x[:] = found
 
 
 class PathIntegrator(Packet):
@@ -197,6 +251,7 @@ class PathIntegrator(Packet):
         super().__init__(space, config, time_step_s, batch)
         draw = torch.Generator().manual_seed(seed)
         k = space.n_frequencies
+        self._walk: np.ndarray | None = None  # constants of compiled steps
         tuning = sample_tuning(k, config.neurons, 3, neurons, draw, radius=_RADIUS)
         self.neurons = NeuronArray(tuning, neurons, time_step_s, draw, batch)
         for name in ("recurrent", "external", "output"):
@@ -225,11 +280,11 @@ class PathIntegrator(Packet):
         # Uniform over the ring's area, not over its radius.
         r, angle, share = uniform(low**2, high**2).sqrt(), uniform(0, 2 * math.pi), uniform(-1, 1)
         point = torch.stack([r * angle.cos(), r * angle.sin()], dim=-1)
-        rates = self.neurons.rates(torch.cat([point, share.unsqueeze(-1)], dim=-1))
+        inputs = torch.cat([point, share.unsqueeze(-1)], dim=-1)
         omega = share * self.fastest_rad_s.unsqueeze(-1)
         back = oscillator_dynamics(point, omega, c.tau_s, c.stabilise)
         targets = torch.cat([back, point], dim=-1)
-        return solve_decoders(rates, targets, c.decoder_noise) / self.time_step_s
+        return self.neurons.solve(inputs, targets, c.decoder_noise) / self.time_step_s
 
     @property
     def z(self) -> Tensor:
@@ -259,12 +314,65 @@ class PathIntegrator(Packet):
         Returns:
             Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.
         """
-        waves = self.space.wave_vectors
+        space, neurons = self.space, self.neurons
+        own = space.frequencies, space.length_scale_m
+        given = (velocity_m_s,) if pull is None else (velocity_m_s, pull)
+        if (
+            velocity_m_s.shape == cast(Tensor, self._buffers["position_m"]).shape
+            and neurons.runs_compiled(*own, *given)
+            and may_share(self, "recurrent", "external", "output", "position_m")
+        ):
+            velocity, numbers = velocity_m_s.to(own[0].dtype).contiguous().numpy(), None
+            if pull is not None:
+                numbers = torch.view_as_real(pull).to(own[0].dtype).contiguous().numpy()
+            return torch.view_as_complex(torch.from_numpy(self.advance(velocity, numbers)))
+        waves = space.wave_vectors
         share = (velocity_m_s @ (waves / self.fastest_rad_s.unsqueeze(-1)).T).clamp(-1.0, 1.0)
         pull = coupled(self.z, pull, self.position_m, self.space, self.config)
         parts = None if pull is None else torch.view_as_real(pull).transpose(0, 1)
         self.drive(share.T, parts)
         return self.locate(velocity_m_s)
+
+    def advance(self, velocity: np.ndarray, pull: np.ndarray | None) -> np.ndarray:
+        """Advance one step as :meth:`forward` does, by compiled steps.
+
+        Args:
+            velocity: ``(batch, dimension)``.
+            pull: ``(batch, n_frequencies, 2)``, or ``None``.
+
+        Returns:
+            ``(batch, n_frequencies, 2)``.
+        """
+        output, recurrent, external = (view(self, n) for n in ("output", "recurrent", "external"))
+        position, walk = view(self, "position_m"), self._walk
+        if pull is None:
+            pull = np.zeros((len(position), len(output), 2), dtype=output.dtype)
+        if walk is None or walk.dtype != output.dtype:
+            c, dt = self.config, self.time_step_s
+            kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
+            walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
+        tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
+        n, batch, _ = output.shape
+        x = np.empty((n, batch, 3), dtype=output.dtype)
+        z = np.empty((batch, n, 2), dtype=output.dtype)
+        later, again, read = (np.empty_like(output) for _ in range(3))
+        if self.coupling == COUPLINGS.index("modules"):
+            pull = pull.copy()
+            for b, inner in enumerate(pull):
+                held = np.ascontiguousarray(output[:, b])
+                couple(tables.modules, held, held, self.coupling, walk[0], inner)
+        manifold = self.coupling == COUPLINGS.index("manifold")
+        oscillators_before(
+            tables.waves, output, recurrent, external, fastest, position, velocity, pull, manifold,
+            walk, x, later,
+        )  # fmt: skip
+        neurons = cast(NeuronArray, self._modules["neurons"])
+        decoded = neurons.respond(x, view(self, "decoders"))
+        oscillators_after(decoded, recurrent, output, walk, again, read, z)
+        position = position + walk[4] * velocity
+        self.locate_compiled(z, position)
+        replace(self, external=later, recurrent=again, output=read, position_m=position)
+        return z
 
     def drive(self, share: Tensor, pull: Tensor | None) -> None:
         """Advance the oscillators one step, in terms of their phases.
@@ -275,8 +383,11 @@ class PathIntegrator(Packet):
         """
         c, dt = self.config, self.time_step_s
         point = self.recurrent + self.external
-        fired = self.neurons(torch.cat([point, share.unsqueeze(-1)], dim=-1))
-        decoded = torch.bmm(fired, self.decoders)
+        x = torch.cat([point, share.unsqueeze(-1)], dim=-1)
+        if self.neurons.runs_compiled(x, self.decoders):
+            decoded = torch.from_numpy(self.neurons.respond(x.numpy(), view(self, "decoders")))
+        else:
+            decoded = torch.bmm(self.neurons(x), self.decoders)
         self.recurrent = lowpass(self.recurrent, decoded[..., :2], synapse(c.tau_s, dt))
         kept = synapse(c.input_tau_s, dt)
         self.external = kept * self.external if pull is None else lowpass(self.external, pull, kept)

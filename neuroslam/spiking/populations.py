@@ -2,11 +2,20 @@
 
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import (
+    NeuronArray,
+    filtered,
+    lowpass,
+    replace,
+    sample_tuning,
+    synapse,
+    view,
+)
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.state.mergeable import BufferModule
 
@@ -62,8 +71,7 @@ class VectorPopulation(BufferModule):
         tuning = tuning._replace(bias=tuning.bias + tuning.gain * scale.squeeze(-1))
         self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
         points = _met(space, region_m, draw)
-        rates = self.neurons.rates(points.unsqueeze(0))
-        decoders = solve_decoders(rates, points.unsqueeze(0), noise=0.05)[0]
+        decoders = self.neurons.solve(points.unsqueeze(0), points.unsqueeze(0), noise=0.05)[0]
         self.register_buffer("decoders", decoders / time_step_s)
         self.register_buffer("decoded", torch.zeros(batch, space.n_frequencies, 2))
 
@@ -136,10 +144,21 @@ class VectorPopulation(BufferModule):
 
     def forward(self, z: Tensor) -> Tensor:
         """Step with a vector; return the decoded vector, both complex, ``(batch, k)``."""
+        if self.neurons.runs_compiled(z, self.decoded, self.decoders):
+            parts = torch.view_as_real(z.resolve_conj()).to(self.decoded).contiguous()
+            return torch.view_as_complex(torch.from_numpy(self.advance(parts.numpy())))
         spikes = self.neurons(torch.view_as_real(z).flatten(-2).unsqueeze(0))[0]
         said = (spikes @ self.decoders).reshape(self.decoded.shape)
         self.decoded = lowpass(self.decoded, said, synapse(TAU_S, self.time_step_s))
         return torch.view_as_complex(self.decoded)
+
+    def advance(self, z: np.ndarray) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
+        x = z.reshape(1, len(z), -1)
+        said = self.neurons.respond(x, view(self, "decoders")[None]).reshape(z.shape)
+        decoded = filtered(view(self, "decoded"), said, synapse(TAU_S, self.time_step_s))
+        replace(self, decoded=decoded)
+        return decoded
 
 
 def _uniform(region_m: Tensor, n: int, draw: torch.Generator) -> Tensor:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import NeuronConfig, SSPSLAMConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
@@ -15,19 +16,37 @@ from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, r
 from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.correction import SpikingCorrection
-from neuroslam.spiking.ensemble import lowpass, synapse
-from neuroslam.spiking.path_integrator import PathIntegrator
+from neuroslam.spiking.ensemble import filtered, lowpass, replace, synapse, view
+from neuroslam.spiking.gaussian import (
+    Gaussian,
+    fit_gaussian,
+    gaussian_damping,
+    sighting_covariance,
+)
+from neuroslam.spiking.path_integrator import REREAD_STEPS, PathIntegrator
 from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.quantise import on_chip, quantised
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.vector_steps import (
+    KNOWN,
+    Scratch,
+    Sights,
+    VectorState,
+    advance,
+    after_recall,
+    before_recall,
+    encode,
+    times,
+    to_features,
+    to_fourier,
+)
 from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
 from neuroslam.worlds.landmarks import LandmarkView
 
 _CHUNK = 200  # steps whose inputs are prepared together
 _GATE_WIDTH = 0.02  # range of similarity over which the gate opens
-_KNOWN = 0.5  # strength of recall above which a landmark is known
 _SETTLED_S = 0.15  # time until neurons represent a landmark and its position is learnt
 _AREA_INTERCEPT = 0.05  # similarity above which cells of the position memory fire
 _CONTRADICTS, _AGREES = 0.5, 0.7  # similarities; side lobes of a space are below the first
@@ -66,6 +85,13 @@ class SSPSLAM(BufferModule):
     the path integrator, if the gate :math:`g` finds that both agree. If a known landmark
     contradicts for ``relocalise_after_s``, the animal was lost and relocalises by it.
 
+    Where sightings have a standard deviation (``sigma_distance_m``, ``sigma_bearing_rad``), the
+    learnt vector is its expectation over the noise, :math:`E[\phi(x_i + \epsilon)]`, each
+    coefficient damped by :func:`~neuroslam.spiking.gaussian.gaussian_damping`; so the memory holds
+    how certain the position is, and coefficients correct the more the more certain they are. It
+    learns the mean of all sightings, each weighted by its certainty (``evidence_s``), until that
+    is as slow as ``map.least_plasticity``.
+
     All tiers have the same parts; see their classes for the equations. Velocities and vectors to
     landmarks are allocentric (rotated by a compass).
 
@@ -93,6 +119,7 @@ class SSPSLAM(BufferModule):
     pull: Tensor
     here: Tensor
     there: Tensor
+    evidence_s: Tensor
 
     def __init__(
         self,
@@ -159,6 +186,8 @@ class SSPSLAM(BufferModule):
         self.register_buffer("held_s", torch.zeros(batch))
         self.register_buffer("familiar", torch.zeros(batch, dtype=torch.bool))
         self.register_buffer("contradicted_s", torch.zeros(batch))
+        if c.has_uncertain_sightings:
+            self.register_buffer("evidence_s", torch.zeros(batch, len(pointers)))
         for name in ("recalled", "pull", "here", "there"):
             self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
 
@@ -185,6 +214,10 @@ class SSPSLAM(BufferModule):
                 f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n_key})"
             )
         names = _checked_names(names, len(pointers))
+        if self.config.has_uncertain_sightings:
+            new = pointers.to(self.pointers)
+            same = (new.unsqueeze(1) == self.pointers).all(-1)
+            self.evidence_s = self.evidence_s @ same.T.to(self.evidence_s)
         self.pointers = pointers.to(self.pointers)
         self._names = names
 
@@ -225,6 +258,8 @@ class SSPSLAM(BufferModule):
             SpaceError: If anything does not fit or is not a number; nothing has changed then.
         """
         velocity, sight = self._inputs(velocity_m_s.unsqueeze(0), with_time(view))
+        if self._runs_compiled(velocity, *sight[:2]):
+            return SSPStep(*(part[0] for part in self._compiled(velocity, sight)))
         return self._step(velocity[0], *(part[0] for part in sight))
 
     @torch.inference_mode()
@@ -247,23 +282,227 @@ class SSPSLAM(BufferModule):
         Returns:
             Results, with the steps in front.
         """
-        results = []
-        for begin in range(0, len(velocity_m_s), _CHUNK):
+        n, kept = len(velocity_m_s), [k for k in range(every - 1, len(velocity_m_s), every)]
+        kept = kept or [n - 1]
+        results: list[SSPStep] = []
+        for begin in range(0, n, _CHUNK):
             part = slice(begin, begin + _CHUNK)
             velocity, sight = self._inputs(velocity_m_s[part], cut(view, part))
+            mine = [k - begin for k in kept if begin <= k < begin + len(velocity)]
+            if watch is None and self._runs_compiled(velocity, *sight[:2]):
+                results.append(SSPStep(*(each[mine] for each in self._compiled(velocity, sight))))
+                continue
+            steps: list[SSPStep] = []
             for k, v in enumerate(velocity):
-                step = self._step(v, *(p[k] for p in sight))
+                now = Sight(*(each[k : k + 1] for each in sight))
+                if self._runs_compiled(v, *now[:2]):
+                    step = SSPStep(*(each[0] for each in self._compiled(v.unsqueeze(0), now)))
+                else:
+                    step = self._step(v, *(each[0] for each in now))
                 if watch is not None:
                     watch(begin + k, step)
-                last = begin + k + 1 == len(velocity_m_s)
-                if (begin + k + 1) % every == 0 or (last and not results):
-                    results.append(step)
-        return SSPStep(*(torch.stack(column) for column in zip(*results, strict=True)))
+                if k in mine:
+                    steps.append(step)
+            if steps:
+                results.append(SSPStep(*(torch.stack(each) for each in zip(*steps, strict=True))))
+        return SSPStep(*(torch.cat(each) for each in zip(*results, strict=True)))
+
+    def _runs_compiled(self, *inputs: Tensor) -> bool:
+        """Return whether compiled steps may take these inputs and the state."""
+        if self.correction is not None or self.config.has_uncertain_sightings:
+            return False
+        space, walk = self.space, self.integrator
+        tensors = (
+            *inputs, self.gate, self.gain, space.frequencies, space.length_scale_m, self.pull,
+            self.recalled, walk.position_m,
+        )  # fmt: skip
+        if isinstance(walk, PathIntegrator):
+            memory = cast(AssociativeMap, self.map)
+            populations = walk.neurons, memory.memory
+            return all(each.runs_compiled(walk.output) for each in populations) and runs_compiled(
+                *tensors, memory.decoders, memory.rule
+            )
+        memory = cast(AlgebraicMap, self.map)
+        return runs_compiled(*tensors, walk.phasor, memory.weights)
+
+    def _compiled(self, velocity: Tensor, sight: Sight) -> SSPStep:
+        """Advance some steps as :meth:`_step` does, compiled; results lead with the steps."""
+        if self.config.tier == "algebraic":
+            return self._compiled_vectors(velocity, sight)
+        v, key, vector, held_s = (
+            part.contiguous().numpy()
+            for part in (velocity, sight.key, torch.view_as_real(sight.vector), sight.held_s)
+        )
+        seen = (sight.attended != NOTHING).numpy()
+        model, flags = self._gate_constants(v.dtype)
+        found = [
+            self._compiled_step(v[k], key[k], vector[k], held_s[k], seen[k], model, flags)
+            for k in range(len(v))
+        ]
+        self._count(sight)
+        position, z, says = (torch.from_numpy(np.stack(each)) for each in zip(*found, strict=True))
+        return _steps_of(position, z, says, sight.attended)
+
+    def _gate_constants(self, kind: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Return constants of compiled steps, of the type of the state.
+
+        Returns:
+            Time until a landmark is settled, time until the animal is lost, least plasticity,
+            similarity below which a landmark contradicts, time step, gate and its width, gain, gain
+            when lost, similarity above which a landmark agrees. And flags: whether known landmarks
+            are learnt more slowly, whether an animal is never lost, whether neurons are quantised,
+            and room for four more.
+        """
+        c, dt = self.config, self.config.time_step_s
+        settled = 1.5 * dt if c.tier == "algebraic" else _SETTLED_S
+        model = np.array(
+            [settled, c.relocalise_after_s, c.map.least_plasticity, _CONTRADICTS, dt,
+             float(self.gate), _GATE_WIDTH, float(self.gain), _LOST_GAIN, _AGREES], dtype=kind,
+        )  # fmt: skip
+        novelty, never = c.map.plasticity == "novelty", c.relocalise_after_s == 0
+        return model, np.array([novelty, never, c.quantised, 0, 0, 0, 0])
+
+    def _compiled_vectors(self, velocity: Tensor, sight: Sight) -> SSPStep:
+        """Advance vectors some steps, in one compiled call."""
+        c, dt = self.config, self.config.time_step_s
+        walk, memory = cast(AlgebraicIntegrator, self.integrator), cast(AlgebraicMap, self.map)
+        places = cast(AlgebraicMap | None, self.places)
+        kind = view(self, "pull").dtype
+        model, flags = self._gate_constants(kind)
+        numbers = np.array([dt, c.integrator.coupling_gain, walk.share, memory.share], dtype=kind)
+        inputs = Sights(
+            velocity.contiguous().numpy(),
+            sight.key.contiguous().numpy(),
+            torch.view_as_real(sight.vector).contiguous().numpy(),
+            (sight.attended != NOTHING).numpy(),
+            sight.held_s.contiguous().numpy(),
+            walk.noise(len(velocity)).to(self.pull).numpy(),
+        )
+        state = VectorState(
+            view(walk, "phasor").copy(),
+            view(walk, "position_m").copy(),
+            view(memory, "weights").copy(),
+            np.zeros((0, 0, 0), kind) if places is None else view(places, "weights").copy(),
+            view(self, "recalled").copy(),
+            view(self, "pull").copy(),
+            view(self, "familiar").copy(),
+            view(self, "contradicted_s").copy(),
+        )
+        found = Scratch.of(inputs, self.space.n_features)
+        begin, age = 0, int(walk.age)
+        while begin < len(velocity):
+            end = min(len(velocity), begin + REREAD_STEPS - (age + begin) % REREAD_STEPS)
+            rereads = (age + end) % REREAD_STEPS == 0
+            parts = [(begin, end - rereads, 0)]
+            if rereads:
+                parts += [(end - 1, end, 1), (end - 1, end, 2)]
+            for first, last, half in parts:
+                if half == 2:
+                    walk.reread(state.phasor, state.position)
+                flags[3:] = walk.coupling, age + first, walk.look_steps, half
+                advance(
+                    tuple(walk.decoder.tables()),
+                    tuple(part[first:last] for part in inputs),
+                    tuple(state),
+                    (*(part[first:last] for part in found[:3]), *found.room),
+                    numbers,
+                    model,
+                    flags,
+                )
+            begin = end
+        replace(walk, phasor=state.phasor, position_m=state.position)
+        walk.age = walk.age + len(velocity)
+        replace(memory, weights=state.weights)
+        if places is not None:
+            replace(places, weights=state.places)
+        replace(
+            self, recalled=state.recalled, pull=state.pull, familiar=state.familiar,
+            contradicted_s=state.contradicted,
+        )  # fmt: skip
+        self._count(sight)
+        at, coefficients, said = (torch.from_numpy(each) for each in found[:3])
+        return _steps_of(at, coefficients, said, sight.attended)
+
+    def _count(self, sight: Sight) -> None:
+        """Note the time, and what is attended to, after some steps."""
+        time = float(self.time_s)
+        for _ in range(len(sight.held_s)):
+            time += self.config.time_step_s
+        self.time_s = torch.full_like(self.time_s, time)
+        self.attended, self.held_s = sight.attended[-1].clone(), sight.held_s[-1].clone()
+
+    def _compiled_step(
+        self,
+        velocity: np.ndarray,
+        key: np.ndarray,
+        vector: np.ndarray,
+        held_s: np.ndarray,
+        seen: np.ndarray,
+        model: np.ndarray,
+        flags: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Advance neurons one step; return position, coefficients, and what ``SSPStep`` says."""
+        walk, memory = cast(PathIntegrator, self.integrator), cast(AssociativeMap, self.map)
+        tables, each = walk.decoder.tables(), range(self.batch)
+        even, odd = tables.even, tables.odd
+        z = walk.advance(velocity, view(self, "pull"))
+        position = view(walk, "position_m")
+        here, recalled = np.empty_like(z), np.empty_like(z)
+        for b in each:
+            encode(tables.waves, position[b], here[b])
+        sees = seen.astype(here.dtype)
+        if self.grid is not None:
+            here = self.grid.advance(here)
+        if self.vectors is not None:
+            vector = self.vectors.advance(vector) * sees[:, None, None]
+            here = self._late_array("here", here, TAU_VECTOR_S)
+        bind = self.binding
+        place = _product(here, vector) if bind is None else bind.advance(here, vector)
+        contradicted, familiar = (view(self, n).copy() for n in ("contradicted_s", "familiar"))
+        value = np.empty((self.batch, even.shape[1]), dtype=here.dtype)
+        now = np.empty((self.batch, 5), dtype=here.dtype)
+        before = view(self, "recalled")
+        for b in each:
+            to_features(even, odd, place[b], value[b])
+            before_recall(before[b], held_s[b], contradicted[b], seen[b], model, flags, now[b])
+        recall = memory.advance(key, value, sees, now[:, 4].copy(), sees)
+        for b in each:
+            to_fourier(even, odd, recall[b], recalled[b])
+        if self.places is not None:
+            places = cast(AssociativeMap, self.places)
+            places.advance(value * sees[:, None], key, sees, now[:, 3].copy(), sees)
+        back = vector * np.array([1.0, -1.0], dtype=vector.dtype)
+        if self.unbinding is None:
+            implied = _product(recalled, back)
+        else:
+            implied = self.unbinding.advance(recalled, back)
+            here = self._late_array("there", here, TAU_BINDING_S)
+        pull, said = np.empty_like(here), np.empty((self.batch, 3), dtype=here.dtype)
+        for b in each:
+            after_recall(
+                implied[b], here[b], seen[b], familiar[b : b + 1], contradicted[b : b + 1], now[b],
+                model, bool(flags[1]), said[b], pull[b],
+            )  # fmt: skip
+        replace(self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted)
+        return position, z, np.stack([now[:, 0], said[:, 0], said[:, 1], now[:, 1]], axis=-1)
+
+    def _late_array(self, name: str, z: np.ndarray, tau_s: float) -> np.ndarray:
+        """Delay as :meth:`_late` does."""
+        late = filtered(view(self, name), z, synapse(tau_s, self.config.time_step_s))
+        replace(self, **{name: late})
+        return late
 
     def _step(
-        self, velocity: Tensor, key: Tensor, vector: Tensor, attended: Tensor, held_s: Tensor
+        self,
+        velocity: Tensor,
+        key: Tensor,
+        vector: Tensor,
+        attended: Tensor,
+        held_s: Tensor,
+        damping: Tensor,
     ) -> SSPStep:
         c, space = self.config, self.space
+        uncertain = c.has_uncertain_sightings
         seen = (attended != NOTHING).to(key)
         # Neurons need a while to represent a landmark; vectors one step, and one to be compared.
         settled = held_s > (1.5 * c.time_step_s if c.tier == "algebraic" else _SETTLED_S)
@@ -277,11 +516,16 @@ class SSPSLAM(BufferModule):
             here = self._late("here", here, TAU_VECTOR_S)
         place = here * vector if self.binding is None else self.binding(here, vector)
         strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
+        if uncertain:  # relative to what a sighting as certain as this one leaves
+            place = place * damping
+            strength = strength / damping.square().mean(-1).sqrt()
         lost = self._is_lost()
         # No learning while landmarks contradict: the map must not adapt to a wrong position.
         doubts = (self.contradicted_s > 0) & (c.relocalise_after_s > 0)
         learns = seen if c.quantised else (settled & ~doubts).to(key)
         plasticity = learns * self._plasticity(strength)
+        if uncertain:
+            plasticity = self._averaging(attended, learns, damping)
         place = space.from_fourier(place)
         recall = space.to_fourier(self.map(key, place, seen, plasticity))
         if self.places is not None:
@@ -292,14 +536,19 @@ class SSPSLAM(BufferModule):
             implied = self.unbinding(recall, vector.conj())
             here = self._late("there", here, TAU_BINDING_S)
         agreement = (implied.real * here.real + implied.imag * here.imag).mean(-1)
+        if uncertain:
+            agreement = agreement / damping.mean(-1)
         # What is learnt in the present visit is no more accurate than the position.
-        familiar = torch.where(settled, self.familiar, strength > _KNOWN)
+        familiar = torch.where(settled, self.familiar, strength > KNOWN)
         known = familiar & settled & (seen > 0)
         gate = torch.sigmoid((agreement - self.gate) / _GATE_WIDTH) * known
-        self._note_contradiction(known, agreement / strength.clamp_min(_KNOWN))
+        self._note_contradiction(known, agreement / strength.clamp_min(KNOWN))
         unit = implied / implied.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
         apart = unit - here
+        if uncertain:
+            certain = implied.abs() / strength.clamp_min(KNOWN).unsqueeze(-1)
+            apart = certain * (implied / implied.abs().clamp_min(1e-6) - here)
         if self.correction is not None:
             gain, apart = self.gain.expand(self.batch), self.correction(implied, here, seen)
             gate = 1.0 - self.correction.veto.clamp(0.0, 1.0)
@@ -336,6 +585,27 @@ class SSPSLAM(BufferModule):
             return torch.ones_like(strength)
         return (1.0 - strength.square()).clamp(c.least_plasticity, 1.0)
 
+    def _averaging(self, attended: Tensor, learns: Tensor, damping: Tensor) -> Tensor:
+        r"""Add a sighting to the evidence, and return the plasticity by which a mean is learnt.
+
+        .. math:: w = \text{mean}_k\, d_k^2, \qquad t \leftarrow t + w\,\Delta t, \qquad
+                  p = w / (\kappa\, t)
+
+        with the damping :math:`d` and the rate of learning :math:`\kappa`; each sighting has the
+        weight :math:`w` in the mean.
+        """
+        c = self.config.map
+        weight = learns * damping.square().mean(-1)
+        row = attended.clamp_min(0).unsqueeze(-1)
+        more = torch.zeros_like(self.evidence_s)
+        more.scatter_(-1, row, (weight * self.config.time_step_s).unsqueeze(-1))
+        self.evidence_s = (self.evidence_s + more).detach()
+        if c.plasticity == "constant":
+            return learns
+        seen_s = self.evidence_s.gather(-1, row).squeeze(-1)
+        share = weight / (c.learning_rate_s * seen_s.clamp_min(1e-9))
+        return learns * share.clamp(c.least_plasticity, 1.0)
+
     def _is_lost(self) -> Tensor:
         after = self.config.relocalise_after_s
         if after == 0:
@@ -368,13 +638,14 @@ class SSPSLAM(BufferModule):
             z = torch.zeros(steps, self.batch, self.space.n_frequencies, 2).to(kind)
             attended = torch.full((steps, self.batch), NOTHING, device=kind.device)
             vector = torch.view_as_complex(z)
+            damping = kind.new_ones(steps, self.batch, 1)
         else:
-            key, vector, attended = self._seen(view, steps)
+            key, vector, attended, damping = self._seen(view, steps)
         held_s = held(attended, self.attended, self.held_s, self.config.time_step_s)
-        return velocity, Sight(key, vector, attended, held_s)
+        return velocity, Sight(key, vector, attended, held_s, damping)
 
-    def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return pointers and vectors of what is attended to, and the attended landmarks."""
+    def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return pointers and vectors of what is attended to, its number, and its damping."""
         c, kind, n = self.config, self.pointers, len(self.pointers)
         in_view = torch.as_tensor(np.asarray(view.in_view), device=kind.device)
         if in_view.shape != (steps, self.batch, n):
@@ -401,14 +672,50 @@ class SSPSLAM(BufferModule):
             key = in_view.to(kind) @ kind
             vector = (z * in_view.unsqueeze(-1)).sum(-2)
             several = torch.where(in_view.sum(-1) > 1, SEVERAL, in_view.to(torch.uint8).argmax(-1))
-            return key, vector, torch.where(in_view.any(-1), several, NOTHING)
+            exact = kind.new_ones(steps, self.batch, 1)
+            return key, vector, torch.where(in_view.any(-1), several, NOTHING), exact
         time = self.time_s + c.time_step_s * torch.arange(steps, dtype=torch.float64)
         attended = attend(in_view, distance, time, c.turn_s, c.attention)
         some, which = attended != NOTHING, attended.clamp_min(0)
         mine = boxes[which].unsqueeze(-1).expand(-1, -1, -1, low.shape[-1])
-        z = region_vectors(self.space, low.gather(2, mine), high.gather(2, mine), weight[which])
+        low, high, weight = low.gather(2, mine), high.gather(2, mine), weight[which]
+        z = region_vectors(self.space, low, high, weight)
         some = some.unsqueeze(-1)
-        return kind[which] * some, z * some, attended
+        return kind[which] * some, z * some, attended, self._damping(low, high, weight, some)
+
+    def _damping(self, low_m: Tensor, high_m: Tensor, weight: Tensor, some: Tensor) -> Tensor:
+        """Return the factors of coefficients by the noise of sightings; 1 where nothing is seen."""
+        c = self.config
+        if not c.has_uncertain_sightings:
+            return weight.new_ones(()).expand(*some.shape)
+        middle = ((low_m + high_m) / 2.0 * weight.unsqueeze(-1)).sum(-2)
+        middle = torch.where(some, middle, 0.0)
+        covariance = sighting_covariance(middle, c.sigma_distance_m, c.sigma_bearing_rad)
+        return gaussian_damping(self.space, covariance)
+
+    def wholeness(self, z: Tensor) -> Tensor:
+        """Return the similarity with its position of a recall that is of one position alone.
+
+        Args:
+            z: Recall as Fourier coefficients, complex, ``(..., n_frequencies)``.
+        """
+        if self.config.has_uncertain_sightings:  # their coefficients are not of one modulus
+            return z.abs().mean(-1)
+        return z.abs().square().mean(-1).sqrt()
+
+    @torch.no_grad()
+    def uncertainty(self, z: Tensor) -> Gaussian | None:
+        """Return the normal distributions that recalls hold; ``None`` if sightings are exact.
+
+        The covariance is that of one sighting as remembered: the noise declared for the sensor, and
+        the scatter of the sightings. The mean of many is better known.
+
+        Args:
+            z: Recall as Fourier coefficients, complex, ``(..., n_frequencies)``.
+        """
+        if not self.config.has_uncertain_sightings:
+            return None
+        return fit_gaussian(self.space, z, free_strength=True)
 
     def _positions(self, position_m: Tensor) -> Tensor:
         """Check positions against the space."""
@@ -426,6 +733,20 @@ class SSPSLAM(BufferModule):
                 f"bounds {self.space.bounds_m.tolist()}; give the space a larger reach_m"
             )
         return position
+
+
+def _steps_of(position: Tensor, z: Tensor, says: Tensor, attended: Tensor) -> SSPStep:
+    """Return results of compiled steps: ``says`` are strength, agreement, gate and lost."""
+    strength, agreement, gate, lost = says.unbind(-1)
+    return SSPStep(
+        position, torch.view_as_complex(z), strength, agreement, gate, lost != 0, attended
+    )
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    product = np.empty_like(a)
+    times(a, b, product)
+    return product
 
 
 def _checked_names(names: Sequence[str], n: int) -> tuple[str, ...]:

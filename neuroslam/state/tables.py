@@ -42,12 +42,37 @@ class GrowingTable(nn.Module):
 
     def append(self, **row: float | Tensor) -> int:
         """Add one row, a value for every column, and return its number."""
-        if self.n == self._column(self.columns[0]).shape[0]:
-            self.reserve(max(16, 2 * self.n))
+        self._make_room()
         for name in self.columns:
-            self._column(name)[self.n] = row[name]
+            column, value = self._column(name), row[name]
+            if column.device.type == "cpu":
+                self._whole(name)[self.n] = value
+            else:
+                column[self.n] = value
         self.n += 1
         return self.n - 1
+
+    def append_empty(self) -> int:
+        """Add one row for the caller to write, into :meth:`storage`, and return its number."""
+        self._make_room()
+        self.n += 1
+        return self.n - 1
+
+    def storage(self) -> dict[str, Tensor]:
+        """Return every column with its spare rows.
+
+        Example:
+            >>> table = GrowingTable({"x_m": ((), torch.float64)})
+            >>> row = table.append_empty()
+            >>> table.storage()["x_m"][row] = 0.5
+            >>> table["x_m"].tolist()
+            [0.5]
+        """
+        return cast(dict[str, Tensor], dict(self._buffers))
+
+    def _make_room(self) -> None:
+        if self.n == self._column(self.columns[0]).shape[0]:
+            self.reserve(max(16, 2 * self.n))
 
     def reserve(self, capacity: int) -> None:
         """Make room for ``capacity`` rows; the rows in use stay."""
@@ -77,11 +102,14 @@ class GrowingTable(nn.Module):
 
     def array(self, name: str) -> np.ndarray:
         """Return the used part of a column on the CPU as numpy's view, a few times faster."""
+        return self._whole(name)[: self.n]
+
+    def _whole(self, name: str) -> np.ndarray:
         column = self._column(name)
         tensor, whole = self._arrays.get(name, (None, None))
         if whole is None or tensor is not column:
             self._arrays[name] = column, whole = column, column.numpy()
-        return whole[: self.n]
+        return whole
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy keeps: numpy's views are of this table's columns alone."""

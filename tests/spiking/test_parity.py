@@ -28,18 +28,9 @@ def as_tensor(array):
 POPULATIONS = {"memory": "memory", "relay": "recall", "error": "error"}
 
 
-def watch(module, parts):
-    """Keep what populations did in the last step."""
-    fired = {}
-    for part in parts:
-        neurons = getattr(module, part)
-
-        def fire(drive, part=part, plain=neurons.fire):
-            fired[part] = plain(drive)
-            return fired[part]
-
-        neurons.fire = fire
-    return fired
+def fired(module, part):
+    """Return which neurons of a population fired in the last step."""
+    return getattr(module, part).spikes[..., 0, :].bool().numpy()
 
 
 def put(neurons, weights, bias, voltage):
@@ -64,7 +55,7 @@ def test_memory_fires_and_learns_as_the_reference(memory_run):
     memory.encoders = as_tensor(ref["memory_scaled_encoders"])[None]
     memory.relay_decoders = as_tensor(ref["recall_to_error_decoders"].T)[None] / 1e-3
     memory.error_decoders = as_tensor(ref["error_to_rule_decoders"].T)[None] / 1e-3
-    fired, wrong = watch(memory, ("memory", "relay", "error")), dict.fromkeys(POPULATIONS, 0)
+    wrong = dict.fromkeys(POPULATIONS, 0)
     for t in range(1000):
         phase = t // 250
         shown = phase < 3
@@ -78,7 +69,7 @@ def test_memory_fires_and_learns_as_the_reference(memory_run):
         seen = torch.tensor([float(shown)], dtype=torch.float64)
         memory(key, value, seen, voja=1.0 + 10.0 * (1.0 - seen))
         for part, name in POPULATIONS.items():
-            wrong[part] += int((fired[part][0, 0].bool().numpy() != ref[f"spikes_{name}"][t]).sum())
+            wrong[part] += int((fired(memory, part)[0] != ref[f"spikes_{name}"][t]).sum())
     assert wrong == dict.fromkeys(POPULATIONS, 0)
     assert ref["spikes_memory"].sum() > 1000
 
@@ -109,7 +100,7 @@ def replayed(ref):
 def test_path_integrator_fires_as_the_reference(integrator_run):
     ref = integrator_run
     walk = replayed(ref)
-    fired, wrong = watch(walk, ("neurons",)), 0
+    wrong = 0
     for t in range(1000):
         # The length scale is in the decoders; the start is told for 49 steps.
         share = as_tensor(ref["A"][:28] @ ref["vel"][t] * ref["vsf"])[:, None]
@@ -117,8 +108,8 @@ def test_path_integrator_fires_as_the_reference(integrator_run):
         read = ref["to_SSP"] @ walk.output.flatten().numpy()
         np.testing.assert_allclose(read, ref["ssp_out"][t], atol=1e-9)
         walk.drive(share, as_tensor(start[:, None, :2]))
-        raw = torch.bmm(fired["neurons"], walk.decoders)[..., 2:]
+        raw = torch.bmm(walk.neurons.spikes, walk.decoders)[..., 2:]
         np.testing.assert_allclose(raw.flatten(), ref["osc_out"][t], atol=1e-9)
-        wrong += int((fired["neurons"][:, 0].bool().numpy() != ref["spikes"][t]).sum())
+        wrong += int((fired(walk, "neurons") != ref["spikes"][t]).sum())
     assert wrong == 0
     assert ref["spikes"].sum() == 132_195
