@@ -162,6 +162,10 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     from neuroslam.runs.inspect import shown_count
 
     figures = summary.to_dict()
+    for note in summary.notes:
+        say(note)
+    for warning in summary.warnings:
+        complain(command, f"warning: {warning}")
     for note in summary.skipped[:3]:
         complain(command, f"skipped: {note}")
     if len(summary.skipped) > 3:
@@ -173,7 +177,7 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
             for what in ("template", "experience", "link", "loop closure")
         )
     )
-    for note in (*summary.notes, *summary.unused):
+    for note in summary.unused:
         say(note)
     if not figures["experiences"]:
         say(
@@ -198,7 +202,9 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         say(line)
     say(f"Written: {out}")
     if summary.failure:
-        complain(command, f"stopped early: {summary.failure}")
+        skips = summary.bad_frame and command == "run"
+        hint = "; or leave out such frames: --on-bad-frame skip" if skips else ""
+        complain(command, f"stopped early: {summary.failure}{hint}")
         return USER_ERROR
     if summary.interrupted:
         complain(command, f"interrupted; continue with: neuroslam resume {out}")
@@ -212,9 +218,10 @@ def _accuracy_lines(summary: "RunSummary") -> list[str]:
     if not found:
         return []
     known = int(found["frames_with_truth"])
+    unit = "arbitrary unit" if summary.measured is False else "m"
     lines = [
-        f"ATE (rigid): map {found['ate_rmse_m']:.3f} m, "
-        f"odometry alone {found['odometry_ate_rmse_m']:.3f} m"
+        f"ATE (rigid): map {found['ate_rmse_m']:.3f} {unit}, "
+        f"odometry alone {found['odometry_ate_rmse_m']:.3f} {unit}"
     ]
     if "ate_similarity_rmse_m" in found:
         lines.append(

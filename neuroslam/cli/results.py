@@ -141,10 +141,12 @@ def plan_command(
     from neuroslam.runs.plan import plan
 
     found = plan(path, goal, out, start)
-    beside = f", {found.beside_m:.2f} m from {goal}" if found.beside_m else ""
+    unit = found.unit
+    beside = f", {found.beside_m:.2f} {unit} from {goal}" if found.beside_m else ""
     say(
         f"From experience {found.path[0]} to {found.path[-1]}{beside}: "
-        f"{counted(len(found.path) - 1, 'link')}, {found.length_m:.2f} m, {found.duration_s:.1f} s"
+        f"{counted(len(found.path) - 1, 'link')}, {found.length_m:.2f} {unit}, "
+        f"{found.duration_s:.1f} s"
     )
     say(f"Written: {', '.join(str(file) for file in found.files)}")
     return 0

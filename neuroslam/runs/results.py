@@ -20,7 +20,15 @@ from neuroslam.runs.files import (
     write_text,
 )
 from neuroslam.runs.plot import draw_map
-from neuroslam.runs.reading import odometry_track, read_metrics, read_trace, trajectory, true_poses
+from neuroslam.runs.reading import (
+    odometry_track,
+    read_metrics,
+    read_trace,
+    trajectory,
+    true_poses,
+    unit_of,
+)
+from neuroslam.runs.sanity import is_animal, unit_warnings
 from neuroslam.state.answers import RUN_FIGURES, counts_of, gathered, tables_of
 
 
@@ -35,6 +43,7 @@ class RunSummary:
     skipped: list[str] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     pictures: bool = False
     measured: bool | None = None
     interrupted: bool = False
@@ -46,6 +55,7 @@ class RunSummary:
     tables: list[str] = field(default_factory=list)
     unplaced: int = 0
     failure: str = ""
+    bad_frame: bool = False
 
     @property
     def cells(self) -> dict[str, float]:
@@ -70,6 +80,7 @@ class RunSummary:
             "skipped": self.skipped,
             "unused": self.unused,
             "notes": self.notes,
+            "warnings": self.warnings,
             "pictures": self.pictures,
             "measured_motion": self.measured,
             "tables": self.tables,
@@ -111,6 +122,8 @@ def write_results(
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
     summary.counts |= gathered(brain.populations.values(), counts_of)
+    if summary.measured:
+        summary.warnings = unit_warnings(trace, is_animal(plan.source, brain.config))
     tables = gathered(brain.populations.values(), tables_of)
     summary.tables = list(tables)
     if truth is not None:
@@ -136,7 +149,7 @@ def write_results(
         for name, table in tables.items():
             write_text(out / name, table)
         write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
-        draw_map(brain, plan, trace, out / "map.png")
+        draw_map(brain, plan, trace, out / "map.png", unit_of(summary.measured))
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary

@@ -25,7 +25,6 @@ from neuroslam.config import (
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.runs.clocks import resolve_offset
 from neuroslam.runs.files import OnBadFrame, RowWriter, RunPlan, brain_file, require_free
-from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
@@ -35,6 +34,7 @@ from neuroslam.sensors.axes import parse_axes
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.threads import limit_threads
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -175,7 +175,7 @@ def run(
         brain.store(one)
     _announce(on_start, stop, opened)
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -190,6 +190,7 @@ def run(
                 brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
             )
         summary.unused = list(opened.unused)
+        summary.notes += [note for note in opened.notes if note not in summary.notes]
         return write_results(brain, plan, out, summary)
 
 
@@ -251,7 +252,7 @@ def resume(
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -323,7 +324,7 @@ def _drive(
     except (SourceError, MapError) as error:
         if brain.half_taken:  # no state to write: what was saved before is kept
             raise RunError(f"{error}; the map is not written: {brain.half_taken}") from error
-        summary.failure = str(error)
+        summary.failure, summary.bad_frame = str(error), isinstance(error, BadFrame)
     summary.interrupted = bool(interrupts)
     # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))

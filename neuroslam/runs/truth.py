@@ -136,9 +136,8 @@ class WithTruth(Source):
 
     def __init__(self, source: Source, path: str | Path, axes: str | None = None) -> None:
         self.source, self.path = source, Path(path)
-        notes: list[str] = []
-        self.track = read_truth(path, axes, notes.append)
-        self.notes = (*source.notes, *notes)
+        self.truth_notes: list[str] = []
+        self.track = read_truth(path, axes, self.truth_notes.append)
         self.name, self.n_frames = source.name, source.n_frames
         self.frame_rate_hz, self.live = source.frame_rate_hz, source.live
         self.landmark_words = source.landmark_words
@@ -157,6 +156,11 @@ class WithTruth(Source):
             f"{start} to {stop}; expected the times of the source"
         )
         return (*self.source.unused, note)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of the source, and how the truth was read."""
+        return (*self.source.notes, *self.truth_notes)
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None

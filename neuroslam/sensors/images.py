@@ -17,7 +17,7 @@ import re
 import tarfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -26,6 +26,7 @@ import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.grey import to_grey
+from neuroslam.sensors.pixels import PixelScale, spread
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.times import (
     UNIT_NAMES,
@@ -112,6 +113,8 @@ class ImageSource(IndexedSource):
         self.clock = Clock(name, times_s, frame_rate_hz)
         self.notes += self.clock.notes
         self.frame_rate_hz = self.clock.frame_rate_hz
+        self.scale: PixelScale | None = None  # of images of more than 8 bits, once there is one
+        self._scale_note = ""
         self.image_shape = self._first_shape()
 
     def frame(self, index: int) -> Frame:
@@ -125,16 +128,35 @@ class ImageSource(IndexedSource):
         return Frame(index, time_s, image=image, velocity=velocity, truth=truth)
 
     def _decoded(self, index: int) -> np.ndarray:
+        pixels = self._pixels(index)
+        if pixels.dtype == np.uint8:
+            return to_grey(pixels, self.grey, "bgr")
+        self.scale = self.scale or self._scale_of_all()
+        try:
+            image = to_grey(self.scale(pixels, index), self.grey, "bgr")
+        except BadFrame as error:
+            raise BadFrame(
+                f"{self.name}: frame {index}: {self.images[index].name}: {error}"
+            ) from None
+        note, before = self.scale.note(), self._scale_note
+        if note != before:
+            told = f"{self.name}: "
+            kept = tuple(line for line in self.notes if not before or line != told + before)
+            self.notes, self._scale_note = (*kept, told + note), note
+        return image
+
+    def _pixels(self, index: int) -> np.ndarray:
+        """Return a decoded image with the bits that it has."""
         file = self.images[index]
         try:
-            image = decode_grey(file.read(), self.grey)
+            pixels = decode(file.read())
         except OSError as error:
             raise BadFrame(
                 f"{self.name}: frame {index}: {file.name} cannot be read ({error.strerror})"
             ) from None
-        if image is None:
+        if pixels is None:
             raise BadFrame(f"{self.name}: frame {index}: {file.name} is corrupt or not an image")
-        return image
+        return pixels
 
     def _first_shape(self) -> tuple[int, ...]:
         first_fault = None
@@ -145,6 +167,15 @@ class ImageSource(IndexedSource):
                 first_fault = first_fault or fault
         others = f"; and so are all {self.n_frames} frames" if self.n_frames > 1 else ""
         raise SourceError(f"{first_fault}{others}") from None
+
+    def _scale_of_all(self) -> PixelScale:
+        examined = []
+        for index in spread(self.n_frames):
+            with suppress(BadFrame):  # reported when it is read
+                pixels = self._pixels(index)
+                if pixels.dtype == np.uint16:
+                    examined.append(pixels)
+        return PixelScale.of(examined)
 
     def _require_one_each(self, n: int, what: str) -> None:
         if n != self.n_frames:
@@ -170,24 +201,52 @@ def require_shape(
         )
 
 
-def decode_grey(data: bytes, rule: GreyRule = "luma") -> np.ndarray | None:
+def decode_grey(
+    data: bytes, rule: GreyRule = "luma", scale: PixelScale | None = None, index: int = 0
+) -> np.ndarray | None:
     """Decode an image to grey by way of colour, as a JPEG's own luminance is rounded differently.
+
+    Args:
+        data: Encoded image.
+        rule: How colour becomes grey.
+        scale: Scale of images of more than 8 bits; default: what this image needs.
+        index: Number of the image in its source.
 
     Returns:
         ``uint8``, ``(h, w)``, or ``None`` if the bytes are not a complete image.
+
+    Raises:
+        BadFrame: If the pixels are neither of 8 nor of 16 bits.
 
     Example:
         >>> decode_grey(cv2.imencode(".png", np.full((2, 3), 7, np.uint8))[1].tobytes()).tolist()
         [[7, 7, 7], [7, 7, 7]]
     """
+    pixels = decode(data)
+    if pixels is None:
+        return None
+    scale = PixelScale.of([pixels]) if scale is None else scale
+    return to_grey(scale(pixels, index), rule, "bgr")
+
+
+def decode(data: bytes) -> np.ndarray | None:
+    """Decode an image with the bits that it has.
+
+    Returns:
+        ``(h, w, 3)`` BGR, ``uint8``, ``uint16`` or of the type of the file, or ``None`` if the
+        bytes are not a complete image.
+    """
     if not data or not _is_complete(data):
         return None
     with quiet_opencv():
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:
-            return None
-    return None if image is None else to_grey(image, rule, "bgr")
+        for flags in (cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, cv2.IMREAD_UNCHANGED):
+            try:
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            except cv2.error:
+                return None
+            if image is not None:  # some types, such as float32, are decoded unchanged only
+                return image
+    return None
 
 
 def _is_complete(data: bytes) -> bool:

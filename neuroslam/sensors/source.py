@@ -22,7 +22,8 @@ class Source(ABC):
         live: Whether the source is live: its frames cannot be read a second time.
         unused: Data that is in no frame, and why, one line each; complete once the source was
             read to its end.
-        notes: How the source was understood where its data did not say it, one line each.
+        notes: How the data is read, where that was a choice, one line each: topics of a bag, units,
+            bits of a pixel; complete once the source was read to its end.
         landmark_words: Names and attributes of its landmarks, empty if it knows none.
     """
 

@@ -64,7 +64,6 @@ class Streams(Source):
                 second._replace(time_s=second.time_s + offset_s),
             )
         self.camera, self.motion = camera, motion
-        self.notes = (*camera.notes, *motion.notes)
         self.n_frames = None
         self.frame_rate_hz = None
         self.live = camera.live or motion.live
@@ -72,6 +71,11 @@ class Streams(Source):
         spans = [_span(camera, first), _span(motion, second)]
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
             raise self._no_overlap(*spans)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of both sources."""
+        return (*self.motion.notes, *self.camera.notes)
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
@@ -168,7 +172,12 @@ class Shifted(Source):
         self.name, self.n_frames = source.name, source.n_frames
         self.frame_rate_hz, self.live = source.frame_rate_hz, source.live
         self.landmark_words = source.landmark_words
-        self.notes = (*source.notes, f"{source.name}: {time_text(offset_s)} are added to its times")
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of the source, and the offset."""
+        added = f"{self.name}: {time_text(self.offset_s)} are added to its times"
+        return (*self.source.notes, added)
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
