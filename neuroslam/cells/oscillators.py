@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from neuroslam.compiled import compiled
 from neuroslam.config import GridCellConfig
 from neuroslam.state.mergeable import Arrays, BufferModule
+from neuroslam.state.pickling import Calls
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
@@ -167,7 +168,7 @@ class VelocityOscillators(BufferModule):
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
         self._waves: tuple[int, Tensor, Tensor] | None = None  # follow from the spacings
         self._wave_arrays: tuple[Tensor, np.ndarray, np.ndarray] | None = None
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget_waves())
+        self.register_load_state_dict_post_hook(Calls("_forget_waves"))
 
     @property
     def waves(self) -> Tensor:
