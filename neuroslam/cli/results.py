@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.table import Table
 
-from neuroslam.cli.options import Landmarks, MapFile, RunFolder, Truth
+from neuroslam.cli.options import Axes, Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
 from neuroslam.errors import RunError, counted
@@ -76,11 +76,18 @@ def ask_command(
         return 0
     if answer.found:
         extra = {"at": ["distance (m)"], "box": ["share in box"]}.get(answer.question.form, [])
-        table = new_table("name", "x (m)", "y (m)", *extra, "kind", "words", title=question)
+        uncertain = any(one.covariance_m2 for one in answer.found)
+        spread = ["sd (m)"] if uncertain else []
+        table = new_table(
+            "name", "x (m)", "y (m)", *spread, *extra, "kind", "words", title=question
+        )
         for one in answer.found:
             number = one.share if answer.question.form == "box" else one.distance_m
             x, y = one.position_m
             more = [f"{number:.2f}"] if extra else []
+            if uncertain:
+                long, short = one.sigma_m
+                more.insert(0, f"{long:.2f} x {short:.2f}" if one.covariance_m2 else "")
             table.add_row(one.name, f"{x:.2f}", f"{y:.2f}", *more, one.kind, one.words)
         say(table)
     if answer.note:
@@ -148,7 +155,17 @@ def plan_command(
 def evaluate_command(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
     truth: Truth = None,
-    align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
+    align: Annotated[
+        str | None,
+        typer.Option(
+            help="rigid, similarity or none; default: rigid, for one camera similarity first."
+        ),
+    ] = None,
+    axes: Axes = None,
+    track_axes: Annotated[
+        str | None,
+        typer.Option(metavar="AXES", help="The same of TRACK, if it is a TUM file."),
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(metavar="RUN", help="Compare the map with that of another run, by ICP."),
@@ -182,12 +199,14 @@ def evaluate_command(
         say(f"Written: {figure}")
         return 0
 
-    table = Table(title=f"{track} and ground truth, {align} alignment")
+    how = f", {align} alignment" if align else ""
+    table = Table(title=f"{track} and ground truth{how}")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []
-    mode = cast("AlignmentMode", align)  # looked at there
-    for name, found, unit in evaluate(track, truth, mode, notes.append):
+    mode = cast("AlignmentMode | None", align)  # looked at there
+    errors = evaluate(track, truth, mode, notes.append, axes, track_axes)
+    for name, found, unit in errors:
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     say(table)
     for note in notes:

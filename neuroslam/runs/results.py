@@ -43,9 +43,9 @@ class RunSummary:
     skipped: list[str] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    measured: bool | None = None
     warnings: list[str] = field(default_factory=list)
     pictures: bool = False
+    measured: bool | None = None
     interrupted: bool = False
     counts: dict[str, float] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
@@ -80,9 +80,9 @@ class RunSummary:
             "skipped": self.skipped,
             "unused": self.unused,
             "notes": self.notes,
-            "measured_motion": self.measured,
             "warnings": self.warnings,
             "pictures": self.pictures,
+            "measured_motion": self.measured,
             "tables": self.tables,
             "interrupted": self.interrupted,
             **self.accuracy,
@@ -136,11 +136,11 @@ def write_results(
                 ).rmse
                 for name, xy in (("ate", track), ("odometry_ate", odometry))
             }
-            if plan.truth:  # a lone camera has no metres: also with a free scale
+            if plan.truth or summary.measured is False:  # one camera has no metres: free scale
                 summary.accuracy["ate_similarity_rmse_m"] = absolute_trajectory_error(
                     track[known, :2], truth[known, :2], "similarity"
                 ).rmse
-                summary.accuracy["frames_with_truth"] = int(known.sum())
+            summary.accuracy["frames_with_truth"] = int(known.sum())
     try:
         # First what cannot be derived again, so that a run killed now can still be resumed.
         save_run(brain, plan, out, summary)
@@ -173,7 +173,7 @@ def read_summary(out: Path) -> RunSummary:
         seconds=float(old["seconds"]),
         cpu_seconds=float(old["cpu_seconds"]),
         skipped=list(old["skipped"]),
-        pictures=bool(old.get("pictures")),
         notes=list(old.get("notes", ())),
+        pictures=bool(old.get("pictures")),
         measured=old.get("measured_motion"),
     )

@@ -174,6 +174,7 @@ def tune(
     report = on_stage or (lambda stage: None)
     with limit_threads():
         tuning = _tune(opened, config, stop, report, features)
+        tuning.notes[:0] = opened.notes
         figure = plot_tuning(tuning, opened.name)
     try:
         out.mkdir(parents=True, exist_ok=True)
