@@ -43,8 +43,13 @@ TIERS = {
         "grid_neurons": 90,
         "places": True,
         "map": SemanticMapConfig(neurons=120, relay=True),
+        "integrator": PathIntegratorConfig(neurons=200, velocity_neurons=200),
     },
-    "quantised": {**SMALL, "quantised": True, "integrator": PathIntegratorConfig(neurons=300)},
+    "quantised": {
+        **SMALL,
+        "quantised": True,
+        "integrator": PathIntegratorConfig(neurons=300, velocity_neurons=200),
+    },
 }
 
 
