@@ -1,6 +1,7 @@
 """SSP-SLAM: neurons beside the same network in Nengo, vectors, and questions to a map."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -64,7 +65,9 @@ class Animals:
         self.now = (self.now + n) % (len(self.at) - n)
 
 
-def milliseconds(pairs: dict[str, object], steps: int = 200, rounds: int = 7) -> dict[str, float]:
+def milliseconds(
+    pairs: dict[str, Callable[[int], object]], steps: int = 200, rounds: int = 7
+) -> dict[str, float]:
     """Median CPU ms of a step, all in turn in each round: what is noisy is so for all."""
     times: dict[str, list[float]] = {name: [] for name in pairs}
     for run in pairs.values():
@@ -91,7 +94,8 @@ def rows() -> list[Row]:
             }
         )
     for batch, name in ((1, "1"), (BATCH, "8")):
-        found.append(_row("path integrator, 13 500 neurons", batch, ms["nengo"], ms[name], 10))
+        times = 10 if batch == 1 else 20
+        found.append(_row("path integrator, 13 500 neurons", batch, ms["nengo"], ms[name], times))
     with nengo_ssp.simulator(nengo_ssp.whole, 500, 550, 50) as reference:
         one, eight = Animals(REFERENCE, 1), Animals(REFERENCE, BATCH)
         ms = milliseconds(
@@ -102,13 +106,14 @@ def rows() -> list[Row]:
             }
         )
     for batch, name in ((1, "1"), (BATCH, "8")):
-        found.append(_row("whole, 27 050 neurons", batch, ms["nengo"], ms[name], 15))
+        times = 15 if batch == 1 else 25
+        found.append(_row("whole, 27 050 neurons", batch, ms["nengo"], ms[name], times))
     algebraic = SSPSLAMConfig(tier="algebraic", time_step_s=0.01)
     for batch in (1, BATCH, 64):
         ms = milliseconds({"": Animals(algebraic, batch).steps})[""]
         speed = batch * algebraic.time_step_s / ms * 1e3
         found.append(
-            Row("algebraic, 100 Hz", f"{batch} animals", "-", ">= 100 sim. s/s", f"{speed:.0f}")
+            Row("algebraic, 100 Hz", f"{batch} animals", "-", ">= 300 sim. s/s", f"{speed:.0f}")
         )
     return found
 
@@ -119,7 +124,7 @@ def _row(what: str, batch: int, reference: float, ours: float, times: int) -> Ro
         what,
         f"batch of {batch}",
         f"Nengo {reference:.2f} ms",
-        f">= {times}x at {BATCH}" if batch == BATCH else "-",
+        f">= {times}x",
         f"{each:.3f} ms a step and animal: {reference / each:.1f}x",
     )
 

@@ -32,8 +32,10 @@ from neuroslam.config.semantic import (
 )
 from neuroslam.mapping.actions import nearest_bound, nearest_bound_of_arrays
 from neuroslam.mapping.relax import Relaxation
+from neuroslam.spiking import vector_steps
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.binding import SpikingBinding
+from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.populations import VectorPopulation
 from neuroslam.spiking.slam import SSPSLAM
@@ -182,7 +184,7 @@ def complex_of(draw, *shape):
 @functools.cache
 def made(name):
     """Return a small module of SSP-SLAM, to be copied."""
-    space = SSPSpace.hexagonal(n_rotations=1, n_scales=2)
+    space = SSPSpace.hexagonal(n_scales=2)
     model = NeuronConfig(model="stepped_lif" if name == "stepped" else "lif", tau_ref_s=0.0023)
     if name in ("walk", "modules", "none"):
         coupling = {"walk": "manifold"}.get(name, name)
@@ -234,9 +236,25 @@ def _a_position_is_integrated_by_neurons(draw):
     for name in ("walk", "modules", "none"):
         walk = placed(with_state(made(name), draw), draw)
         walk.age.fill_(int(draw.choice([2, 3, 99])))
-        pull = None if draw.random() < 0.3 else complex_of(draw, 2, 6)
+        pull = None if draw.random() < 0.3 else complex_of(draw, 2, 18)
         pairs += by_both(walk, lambda w, pull=pull: [torch.view_as_real(w(velocity, pull))])
     return pairs
+
+
+@case("spiking.vector_steps.search", "spiking.vector_steps.similarity")
+def _a_position_is_decoded(draw):
+    space = SSPSpace.hexagonal(n_scales=2).double()
+    decoder, at = PositionDecoder(space), torch.from_numpy(draw.uniform(-0.9, 0.9, 2))
+    z = space.encode_fourier(at) + 0.1 * complex_of(draw, 18)
+    expected, parts, x = decoder(z), torch.view_as_real(z).numpy(), np.empty(2)
+    tables = decoder.tables()
+    best = vector_steps.search(tuple(tables), parts, x)
+    alike = vector_steps.similarity(tables.waves, parts, at.numpy())
+    return [
+        (expected.position_m.numpy(), x),
+        (expected.similarity.numpy(), best),
+        (decoder.similarity(z, at).numpy(), alike),
+    ]
 
 
 @functools.cache

@@ -2,12 +2,16 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig
-from neuroslam.spiking.path_integrator import Packet, coupled
+from neuroslam.spiking.ensemble import may_share, replace, view
+from neuroslam.spiking.path_integrator import REREAD_STEPS, Packet, coupled
 from neuroslam.spiking.space import SSPSpace
+from neuroslam.spiking.vector_steps import Scratch, Sights, VectorState, advance
 from neuroslam.state.mergeable import BufferModule
 
 
@@ -72,7 +76,14 @@ class AlgebraicIntegrator(Packet):
 
     def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
         """Advance one step; arguments as for :class:`~.path_integrator.PathIntegrator`."""
-        c, dt = self.config, self.time_step_s
+        c, dt, space = self.config, self.time_step_s, self.space
+        given = (velocity_m_s,) if pull is None else (velocity_m_s, pull)
+        if (
+            velocity_m_s.shape == self.position_m.shape
+            and runs_compiled(space.frequencies, space.length_scale_m, *given)
+            and may_share(self, "phasor", "position_m")
+        ):
+            return self._compiled(velocity_m_s, pull)
         turn = (velocity_m_s * dt) @ self.space.wave_vectors.T
         if c.phase_noise_rad > 0:
             turn = turn + self.noise(1)[0].to(turn)
@@ -83,6 +94,32 @@ class AlgebraicIntegrator(Packet):
         z = z / z.abs().clamp_min(1e-6) * torch.polar(torch.ones_like(turn), turn)
         self.phasor = torch.view_as_real(z)
         return self.locate(velocity_m_s)
+
+    def _compiled(self, velocity_m_s: Tensor, pull: Tensor | None) -> Tensor:
+        """Advance one step as :meth:`forward` does, compiled."""
+        phasor, position = view(self, "phasor").copy(), view(self, "position_m").copy()
+        velocity = velocity_m_s.to(self.phasor).contiguous().numpy()[None]
+        kind, (batch, k, _) = phasor.dtype, phasor.shape
+        pulled = np.zeros_like(phasor)
+        if pull is not None:
+            pulled = torch.view_as_real(pull).to(self.phasor).numpy().copy()
+        nothing, numbers = np.zeros((1, batch, 0), dtype=kind), np.zeros((1, batch), dtype=kind)
+        unseen, noise = np.zeros((1, batch), dtype=bool), self.noise(1).to(self.phasor).numpy()
+        inputs = Sights(velocity, nothing, nothing[..., None], unseen, numbers, noise)
+        state = VectorState(
+            phasor, position, nothing, nothing, phasor, pulled, unseen[0], numbers[0]
+        )
+        found = Scratch.of(inputs, 2 * k + 1)
+        walk = np.array([self.time_step_s, self.config.coupling_gain, self.share, 0], dtype=kind)
+        flags = np.array([0, 0, 0, self.coupling, int(self.age), self.look_steps, 1])
+        advance(
+            tuple(self.decoder.tables()), tuple(inputs), tuple(state),
+            (*found[:3], *found.room), walk, numbers[0], flags,
+        )  # fmt: skip
+        if (int(self.age) + 1) % REREAD_STEPS == 0:
+            self.reread(phasor, position)
+        replace(self, phasor=phasor, position_m=position, age=np.array(int(self.age) + 1))
+        return self.z
 
     @property
     def share(self) -> float:

@@ -13,7 +13,6 @@ from neuroslam.spiking.ensemble import (
     lowpass,
     replace,
     sample_tuning,
-    solve_decoders,
     synapse,
     view,
 )
@@ -71,7 +70,7 @@ class SpikingBinding(BufferModule):
         tuning = tuning._replace(encoders=tuning.encoders.sign())
         self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
         points = torch.linspace(-_RADIUS, _RADIUS, _SOLVER_POINTS).expand(groups, -1).unsqueeze(-1)
-        decoders = solve_decoders(self.neurons.rates(points), points.square(), noise=0.01)
+        decoders = self.neurons.solve(points, points.square(), noise=0.01)
         self.register_buffer("decoders", (decoders / time_step_s).mT.contiguous())
         self.register_buffer("product", torch.zeros(batch, n_frequencies, 2))
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.binding import SpikingBinding
-from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, solve_decoders, synapse
+from neuroslam.spiking.ensemble import NeuronArray, lowpass, sample_tuning, synapse
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
@@ -76,7 +76,7 @@ class SpikingCorrection(BufferModule):
         points = torch.randn(1, _SOLVER_POINTS, size, generator=draw)
         share = torch.rand(1, _SOLVER_POINTS, 1, generator=draw)
         points = radius * share * points / points.norm(dim=-1, keepdim=True)
-        decoders = solve_decoders(self.neurons.rates(points), points) / time_step_s
+        decoders = self.neurons.solve(points, points) / time_step_s
         self.register_buffer("decoders", decoders)
         self.products = SpikingBinding(
             n_frequencies, products, config, time_step_s, seed + 1, batch
@@ -87,7 +87,7 @@ class SpikingCorrection(BufferModule):
         self.objecting = NeuronArray(tuning, config, time_step_s, draw, batch)
         x = torch.linspace(-1.0, 2.0, 500).reshape(1, -1, 1)
         objects = (x > 1.0 - gate).to(x)
-        decoders = solve_decoders(self.objecting.rates(x), objects) / time_step_s
+        decoders = self.objecting.solve(x, objects) / time_step_s
         self.register_buffer("veto_decoders", decoders)
         self.register_buffer("difference", torch.zeros(batch, n_frequencies, 2))
         self.register_buffer("alike", torch.zeros(batch))

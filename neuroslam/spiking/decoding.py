@@ -64,7 +64,7 @@ class PositionDecoder:
     def __init__(self, space: SSPSpace) -> None:
         self.space = space
         self._waves: Tensor | None = None
-        self._tables: tuple[Tensor, Tensor, tuple[int, int], SpaceTables] | None = None
+        self._tables: tuple[Tensor, Tensor, tuple[object, ...], SpaceTables] | None = None
 
     def __call__(self, z: Tensor) -> Decoded:
         """Decode Fourier coefficients, complex, ``(..., n_frequencies)``.
@@ -172,9 +172,9 @@ class PositionDecoder:
         return self._points
 
 
-def _version(tensor: Tensor) -> int:
-    """Return how often a tensor was changed in place; 0 where torch does not count."""
-    return 0 if tensor.is_inference() else tensor._version
+def _version(tensor: Tensor) -> tuple[int, int]:
+    """Return where a tensor's numbers are, and how often they were changed in place."""
+    return tensor.data_ptr(), 0 if tensor.is_inference() else tensor._version
 
 
 class LearnedDecoder(nn.Module):

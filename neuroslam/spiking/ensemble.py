@@ -184,9 +184,9 @@ def may_share(module: BufferModule, *names: str) -> bool:
     """Return whether compiled steps may take these buffers; quick for those that they have set."""
     views = module.__dict__.get("_views") or {}
     for name in names:
-        buffer = module._buffers[name]
-        known = views.get(name)
-        if (known is None or known[0] is not buffer) and not runs_compiled(cast(Tensor, buffer)):
+        buffer, known = cast(Tensor, module._buffers[name]), views.get(name)
+        shared = known is not None and known[0] is buffer and not buffer.requires_grad
+        if not shared and not runs_compiled(buffer):
             return False
     return True
 
@@ -274,6 +274,27 @@ class NeuronArray(BufferModule):
         """Return the rates under constant input, Hz; ``(groups, points, neurons)``."""
         return rates(self.currents(x), self.config, self.time_step_s)
 
+    def solve(self, points: Tensor, targets: Tensor, noise: float = 0.1) -> Tensor:
+        """Solve for decoders of a function, see :func:`solve_decoders`.
+
+        One group after the other: the rates of all groups at all points fill no cache.
+
+        Args:
+            points: ``(groups, n, dimensions)``.
+            targets: The function there, ``(groups, n, outputs)``.
+            noise: As a share of the highest rate.
+
+        Returns:
+            ``(groups, neurons, outputs)``.
+        """
+        solved = []
+        for g in range(len(points)):
+            own = slice(g, g + 1)
+            current = torch.baddbmm(self.bias[own, None], points[own], self.weights[own].mT)
+            activity = rates(current, self.config, self.time_step_s)
+            solved.append(solve_decoders(activity, targets[own], noise))
+        return torch.cat(solved)
+
     def forward(self, x: Tensor) -> Tensor:
         """Step with vectors as input, ``(groups, batch, dimensions)``."""
         share = self.charged
@@ -299,7 +320,7 @@ class NeuronArray(BufferModule):
             Spikes in this step, 0 or 1; of rates, how many are to be expected. Same shape.
         """
         model = self.config.model
-        if model in ("lif_rate", "relu"):
+        if self._has_rates:
             return rates(1.0 - drive / self.charged, self.config) * self.time_step_s
         if self.runs_compiled(drive):
             return torch.from_numpy(self.fire_compiled(drive.contiguous().numpy()).copy())
@@ -310,10 +331,12 @@ class NeuronArray(BufferModule):
         self.spikes = fired
         return fired
 
+    @property
+    def _has_rates(self) -> bool:
+        return self.config.model in ("lif_rate", "relu")
+
     def runs_compiled(self, *tensors: Tensor) -> bool:
         """Return whether a compiled step may advance the neurons and take these tensors."""
-        if self.config.model not in ("lif", "stepped_lif"):
-            return False
         weights = cast(Tensor, self._buffers["weights"])
         return runs_compiled(weights, *tensors) and may_share(self, "deficit", "asleep")
 
@@ -322,7 +345,8 @@ class NeuronArray(BufferModule):
     ) -> np.ndarray:
         """Step with vectors as input, and decode, in one compiled pass.
 
-        The spikes of :meth:`forward` times the decoders.
+        The spikes of :meth:`forward` times the decoders. Rates are left to torch: all neurons have
+        one, so nothing is gained where few fire, and its logarithm is vectorised.
 
         Args:
             x: ``(groups, batch, dimensions)``.
@@ -341,6 +365,11 @@ class NeuronArray(BufferModule):
                 f"NeuronArray: inputs {x.shape} and decoders {decoders.shape} do not fit "
                 f"(groups, batch, neurons) = {deficit.shape}"
             )
+        if self._has_rates:
+            more_t = torch.from_numpy(added).unsqueeze(-1)
+            drive = torch.from_numpy(folded.rest).unsqueeze(1) + more_t
+            drive = torch.baddbmm(drive, torch.from_numpy(x), torch.from_numpy(folded.slopes))
+            return torch.bmm(self.fire(drive), torch.from_numpy(decoders)).numpy()
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
         decoded = np.empty((groups, batch, decoders.shape[2]), dtype=deficit.dtype)
         respond(
@@ -354,6 +383,8 @@ class NeuronArray(BufferModule):
         deficit = view(self, "deficit")
         if drive.shape != deficit.shape:
             raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
+        if self._has_rates:
+            return self.fire(torch.from_numpy(drive)).numpy()
         asleep, spikes = view(self, "asleep"), self._spikes(deficit)
         rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
         now, owing, paused, fired = rows

@@ -17,7 +17,6 @@ from neuroslam.spiking.ensemble import (
     may_share,
     replace,
     sample_tuning,
-    solve_decoders,
     synapse,
     view,
 )
@@ -298,11 +297,11 @@ class PathIntegrator(Packet):
         # Uniform over the ring's area, not over its radius.
         r, angle, share = uniform(low**2, high**2).sqrt(), uniform(0, 2 * math.pi), uniform(-1, 1)
         point = torch.stack([r * angle.cos(), r * angle.sin()], dim=-1)
-        rates = self.neurons.rates(torch.cat([point, share.unsqueeze(-1)], dim=-1))
+        inputs = torch.cat([point, share.unsqueeze(-1)], dim=-1)
         omega = share * self.fastest_rad_s.unsqueeze(-1)
         back = oscillator_dynamics(point, omega, c.tau_s, c.stabilise)
         targets = torch.cat([back, point], dim=-1)
-        return solve_decoders(rates, targets, c.decoder_noise) / self.time_step_s
+        return self.neurons.solve(inputs, targets, c.decoder_noise) / self.time_step_s
 
     @property
     def z(self) -> Tensor:

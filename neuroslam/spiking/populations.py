@@ -14,7 +14,6 @@ from neuroslam.spiking.ensemble import (
     may_share,
     replace,
     sample_tuning,
-    solve_decoders,
     synapse,
     view,
 )
@@ -73,8 +72,7 @@ class VectorPopulation(BufferModule):
         tuning = tuning._replace(bias=tuning.bias + tuning.gain * scale.squeeze(-1))
         self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
         points = _met(space, region_m, draw)
-        rates = self.neurons.rates(points.unsqueeze(0))
-        decoders = solve_decoders(rates, points.unsqueeze(0), noise=0.05)[0]
+        decoders = self.neurons.solve(points.unsqueeze(0), points.unsqueeze(0), noise=0.05)[0]
         self.register_buffer("decoders", decoders / time_step_s)
         self.register_buffer("decoded", torch.zeros(batch, space.n_frequencies, 2))
 

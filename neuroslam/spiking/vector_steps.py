@@ -472,6 +472,10 @@ def advance(
                     track(waves, space[1], space[2], z, x)
                 encode(waves, x, here)
             if flags[6] == 1:
+                copy(x, positions[t, b])
+                for k in range(n):
+                    zs[t, b, k, 0], zs[t, b, k, 1] = z[k, 0], z[k, 1]
+                    pull[b, k, 0] = pull[b, k, 1] = 0.0
                 continue
             before_recall(recalled[b], held[t, b], contradicted[b], sees, model, flags, now)
             if sees:

@@ -105,6 +105,40 @@ def test_a_map_that_was_saved_goes_on_bit_for_bit(tier, tmp_path):
     assert loaded.names == WORLD.names
 
 
+def still(slam, steps):
+    at = np.tile([0.4, 0.05], (steps, 1, 1))
+    return slam.run(torch.zeros(steps, 1, 2), views([WORLD], at))
+
+
+@pytest.mark.parametrize("tier", ["algebraic", "spiking"])
+def test_a_copy_steps_without_the_original(tier):
+    slam = slam_in(SSPSLAMConfig(**TIERS[tier]), WORLD)
+    still(slam, 5)
+    before = {name: value.clone() for name, value in slam.state_dict().items()}
+    other = deepcopy(slam)
+    still(other, 5)
+    for name, value in slam.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    still(slam, 5)
+    for name, value in slam.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("tier", ["algebraic", "spiking"])
+def test_steps_follow_a_space_that_changes(tier, monkeypatch):
+    slam = slam_in(SSPSLAMConfig(**TIERS[tier]), WORLD)
+    slam.start(torch.tensor([[0.4, 0.3]]))
+    still(slam, 5)
+    with torch.no_grad():
+        slam.space.length_scale_m.mul_(1.1)
+    other, found = deepcopy(slam), []
+    for each, enabled in ((slam, True), (other, False)):
+        monkeypatch.setattr("neuroslam.compiled.ENABLED", enabled)
+        found.append(still(each, 20).position_m)
+    torch.testing.assert_close(*found, atol=2e-3, rtol=0)
+    assert float((found[0][-1] - torch.tensor([[0.4, 0.3]])).norm()) > 0.02
+
+
 @pytest.mark.parametrize(("steps", "every", "returned"), [(3, 5, 1), (5, 5, 1), (11, 5, 2)])
 def test_a_run_returns_every_nth_step_or_the_last_of_fewer(steps, every, returned):
     path = circle(0.01 * steps, 0.01, laps=0.02)
@@ -226,12 +260,12 @@ def test_a_walk_is_the_same_at_two_time_steps():
 def test_a_kidnapped_animal_relocalises_at_a_known_landmark(tier):
     slam = deepcopy(walked(tier)[0])
     true = np.array([0.4, 0.05])
-    still = LandmarkPath(
+    path = LandmarkPath(
         slam.config.time_step_s, np.tile(true, (round(2.5 / slam.config.time_step_s), 1))
     )
     slam.start(torch.tensor([[-0.6, 0.7]]))
-    view = views([WORLD], still.position_m[:, None])
-    said = slam.run(torch.zeros(len(still.position_m), 1, 2), view)
+    view = views([WORLD], path.position_m[:, None])
+    said = slam.run(torch.zeros(len(path.position_m), 1, 2), view)
     assert bool(said.lost.any())
     assert not bool(said.lost[-1])
     # It is where the map puts it; that is as near as a few neurons have the landmark.
@@ -245,8 +279,7 @@ def test_without_relocalisation_the_animal_stays_lost():
     slam = slam_in(config, WORLD)
     simulate(slam, [WORLD], [circle()])
     slam.start(torch.tensor([[-0.6, 0.7]]))
-    still = np.tile([0.4, 0.05], (300, 1, 1))
-    slam.run(torch.zeros(300, 1, 2), views([WORLD], still))
+    still(slam, 300)
     assert float((slam.integrator.position_m - torch.tensor([[0.4, 0.05]])).norm()) > 0.5
 
 
