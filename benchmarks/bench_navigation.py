@@ -1,10 +1,15 @@
 """Boundary, grid and place cells together: one animal, 32 animals, and many place cells."""
 
+import statistics
+import time
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.timing import Row, cpu_ms
+from neuroslam import compiled
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.config import BrainConfig
 from neuroslam.worlds.arena import named_arena
@@ -20,7 +25,9 @@ WARM, TIMED = 4_000, 2_000
 class Rat:
     """Cells and what they sense, step by step; a walk at the speed of a foraging rat."""
 
-    def __init__(self, batch: int | None = None, arena: str = "circle2m") -> None:
+    def __init__(
+        self, batch: int | None = None, arena: str = "circle2m", walls_by: str = "walls"
+    ) -> None:
         walk = roam(named_arena(arena), 8.0, np.random.default_rng(0), speed_m_s=0.18)
         senses = sense(walk, SenseNoise(), range(batch or 1), k=2)
         columns = (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
@@ -30,8 +37,10 @@ class Rat:
         if batch is None:
             self.columns = [column[:, 0].contiguous() for column in self.columns]
         self.dt_s = senses.dt_s.tolist()
-        self.cells = NavigationCells(BrainConfig(), batch=batch)
+        config = BrainConfig(wall_memory={"senses": walls_by})
+        self.cells = NavigationCells(config, batch=batch)
         self.at = 0
+        self.recorded: list[np.ndarray] = []
 
     def steps(self, n: int) -> None:
         for _ in range(n):
@@ -39,6 +48,13 @@ class Rat:
             speed, heading, wall, bearing = (column[i] for column in self.columns)
             self.cells(speed, heading, self.dt_s[i], wall, bearing)
             self.at += 1
+
+    def recorded_steps(self, n: int) -> None:
+        """Do as :meth:`steps`, and record the rates of all cells in every step."""
+        self.recorded.clear()
+        for _ in range(n):
+            self.steps(1)
+            self.recorded.append(self.cells.rates)
 
     def recruit(self, n: int) -> None:
         """Give it so many place cells, on a lattice around where it is."""
@@ -61,16 +77,34 @@ class Rat:
         self.cells.load_state_dict(state)
 
 
+def without_and_with(make: Callable[[], Callable[[int], None]]) -> tuple[float, float]:
+    """Median CPU seconds of 30 minutes without and with compiled steps, in turns."""
+    runs, times = {}, {False: [], True: []}
+    for enabled in times:
+        compiled.ENABLED = enabled
+        runs[enabled] = make()
+        runs[enabled](WARM)
+    for _ in range(5):
+        for enabled, run in runs.items():
+            compiled.ENABLED = enabled
+            began = time.process_time()
+            run(TIMED)
+            times[enabled].append((time.process_time() - began) * STEPS_30_MIN / TIMED)
+    return statistics.median(times[False]), statistics.median(times[True])
+
+
 @torch.inference_mode()
 def rows() -> list[Row]:
     found = []
-    for arena in ("circle2m", "triangle"):
-        rat = Rat(arena=arena)
-        rat.steps(WARM)
-        ms = cpu_ms(lambda rat=rat: rat.steps(TIMED), 1, 5) / TIMED
-        s = ms * STEPS_30_MIN / 1e3
-        size = f"30 min at 20 Hz, {arena}"
-        found.append(Row("navigation cells, one animal", size, "-", "<= 10 s", f"{s:.1f} s"))
+    for what, make, target in (
+        ("circle2m", lambda: Rat().steps, "<= 1.5 s"),
+        ("triangle", lambda: Rat(arena="triangle").steps, "<= 1.5 s"),
+        ("circle2m, rates recorded", lambda: Rat().recorded_steps, "<= 2 s"),
+        ("circle2m, walls by cells", lambda: Rat(walls_by="boundary_cells").steps, "-"),
+    ):
+        off, on = without_and_with(make)
+        measured = f"{on:.1f} s, {off:.1f} s if not compiled"
+        found.append(Row("navigation cells, one animal", f"30 min, {what}", "-", target, measured))
     rats = Rat(BATCH)
     rats.steps(WARM)
     ms = cpu_ms(lambda: rats.steps(TIMED // 4), 1, 5) / (TIMED // 4) / BATCH

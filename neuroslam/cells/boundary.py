@@ -1,16 +1,18 @@
 """Boundary cells: a population whose rates encode distance and bearing of walls."""
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import compiled
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.frames import checked_array
-from neuroslam.state.mergeable import BufferModule
+from neuroslam.state.mergeable import Arrays, BufferModule
 
 INHIBITION, ATTENUATION, GROWTH = 0, 1, 2
 """Zones of the activity of boundary cells, from far to near."""
@@ -98,6 +100,60 @@ def boundary_tuning(
     return by_bearing.mT @ by_distance
 
 
+@compiled
+def respond_step(
+    speed_m_s: float, heading_rad: float, distance_m: np.ndarray, relative_rad: np.ndarray,
+    bearing_rad: np.ndarray, reach_m: float, rate_per_s: float, dt_s: float, sigma_m: np.ndarray,
+    beta_m: np.ndarray, sigma_rad: np.ndarray, preferred_m: np.ndarray, preferred_rad: np.ndarray,
+    activity: np.ndarray, rates: np.ndarray,
+) -> float:  # fmt: skip
+    """Do as :func:`boundary_activity` and :func:`boundary_tuning` for one animal, in place.
+
+    Returns:
+        Distance to the nearest wall; NaN if a number is not one that senses can measure: then
+        nothing but ``bearing_rad`` has changed.
+    """
+    nearest, total = np.inf, speed_m_s + heading_rad
+    for w in range(distance_m.shape[0]):
+        bearing_rad[w] = relative_rad[w] + heading_rad
+        total += bearing_rad[w]
+        if not distance_m[w] >= 0.0:
+            return np.nan
+        nearest = min(nearest, distance_m[w])
+    if not np.isfinite(total):
+        return np.nan
+    grown = 0.0
+    if nearest <= reach_m:
+        near = (reach_m - nearest) * (rate_per_s * dt_s / reach_m)
+        grown = activity[()] + (near if nearest <= reach_m / 2 else -near)
+        grown = min(max(grown, 0.0), 1.0)
+    activity[()] = grown
+    gate = activity[()]
+    half, turn, two_pi = np.float32(math.sqrt(0.5)), np.float32(math.pi), np.float32(TWO_PI)
+    for k in range(preferred_rad.shape[0]):
+        for d in range(preferred_m.shape[0]):
+            rates[k, d] = 0.0
+    if gate == 0.0:
+        return nearest
+    by_distance = np.empty(preferred_m.shape[0], np.float32)
+    for w in range(distance_m.shape[0]):
+        away = np.float32(min(distance_m[w], _FAR_M))
+        for d in range(preferred_m.shape[0]):
+            width = sigma_m[()] * (preferred_m[d] / beta_m[()] + np.float32(1.0))
+            far = (away - preferred_m[d]) * (half / width)
+            by_distance[d] = math.exp(-far * far)
+        for k in range(preferred_rad.shape[0]):
+            apart = (np.float32(bearing_rad[w]) - preferred_rad[k] + turn) % two_pi - turn
+            apart *= half / sigma_rad[()]
+            by_bearing = math.exp(-apart * apart)
+            for d in range(preferred_m.shape[0]):
+                rates[k, d] += by_bearing * by_distance[d]
+    for k in range(preferred_rad.shape[0]):
+        for d in range(preferred_m.shape[0]):
+            rates[k, d] *= gate
+    return nearest
+
+
 class BoundaryCells(BufferModule):
     """Population of ``n_bearings`` by ``n_distances`` boundary cells.
 
@@ -172,6 +228,31 @@ class BoundaryCells(BufferModule):
         rates = self.activity[..., None, None] * tuned
         self.rates = rates.detach()
         return rates
+
+    def respond_compiled(
+        self, speed_m_s: float, heading_rad: float, distance_m: np.ndarray,
+        relative_rad: np.ndarray, dt_s: float,
+    ) -> tuple[float, np.ndarray]:  # fmt: skip
+        """Do as :meth:`forward` for one animal, in place, by bearings relative to the heading.
+
+        Returns:
+            Distance to the nearest wall, and bearings of the walls in the world.
+
+        Raises:
+            BadFrame: If motion or walls cannot be measured; nothing has changed then.
+        """
+        sigma_m, beta_m, sigma_rad, preferred_m, preferred_rad, activity, rates = cast(
+            Arrays, self.arrays()
+        )
+        c, bearing = self.config, np.empty(len(relative_rad))
+        nearest = respond_step(
+            speed_m_s, heading_rad, distance_m, relative_rad, bearing, c.reach_m, c.rate_per_s,
+            dt_s, sigma_m, beta_m, sigma_rad, preferred_m, preferred_rad, activity, rates,
+        )  # fmt: skip
+        if nearest != nearest:  # NaN
+            check_motion(*torch.tensor([speed_m_s, heading_rad], dtype=torch.float64))
+            check_walls(torch.from_numpy(distance_m), torch.from_numpy(relative_rad))
+        return nearest, bearing
 
     def rest(self) -> None:
         """Set all activity to 0, as without a wall in reach."""

@@ -1,6 +1,7 @@
 """Boundary cells as a sheet of bearing by warped distance, whose responses are read as walls."""
 
 import math
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from neuroslam.cells.convolve import (
     excite_and_inhibit,
     gaussian_difference,
 )
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.scan import checked_ranges
@@ -83,6 +85,113 @@ def _bumps(
     return by_bearing.mT @ (far / widths[1]).square().mul(-0.5).exp()
 
 
+@compiled
+def respond_step(
+    distance_m: np.ndarray, bearing_rad: np.ndarray, bearings_rad: np.ndarray,
+    warped_m: np.ndarray, widths: tuple[float, float], beta_m: float,
+    gains: tuple[float, float], excite_a: np.ndarray, excite_d: np.ndarray,
+    inhibit_a: np.ndarray, inhibit_d: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return the responses to walls, as :meth:`BoundarySheet.forward` does.
+
+    A wall's bump is the product of a bearing's and a distance's, and so is what it spreads to.
+    """
+    n, m = bearings_rad.shape[0], warped_m.shape[0]
+    out = np.zeros((n, m))
+    a, d, spread_a, spread_d = np.empty(n), np.empty(m), np.empty((2, n)), np.empty((2, m))
+    for w in range(distance_m.shape[0]):
+        if not np.isfinite(distance_m[w]):
+            continue
+        xi = beta_m * math.log1p(distance_m[w] / beta_m)
+        for i in range(n):
+            spread_a[0, i] = spread_a[1, i] = 0.0
+        for i in range(m):
+            spread_d[0, i] = spread_d[1, i] = 0.0
+        for k in range(n):
+            apart = (bearing_rad[w] - bearings_rad[k] + math.pi) % TWO_PI - math.pi
+            a[k] = math.exp(-0.5 * (apart / widths[0]) ** 2)
+            for i in range(n):  # the matrices are symmetric
+                spread_a[0, i] += a[k] * excite_a[k, i]
+                spread_a[1, i] += a[k] * inhibit_a[k, i]
+        for k in range(m):
+            d[k] = math.exp(-0.5 * ((xi - warped_m[k]) / widths[1]) ** 2)
+            for i in range(m):
+                spread_d[0, i] += d[k] * excite_d[k, i]
+                spread_d[1, i] += d[k] * inhibit_d[k, i]
+        for k in range(n):
+            excite, inhibit = gains[0] * spread_a[0, k], gains[1] * spread_a[1, k]
+            for i in range(m):
+                out[k, i] += a[k] * d[i] + excite * spread_d[0, i] - inhibit * spread_d[1, i]
+    for k in range(n):
+        for i in range(m):
+            out[k, i] = max(out[k, i], 0.0)
+    return out
+
+
+@compiled
+def read_step(
+    rates: np.ndarray, lowest: float, sigmas: tuple[float, float], step_m: float, beta_m: float,
+    bearings_rad: np.ndarray, warped_m: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Read walls as :meth:`BoundarySheet.read` does for one animal.
+
+    Returns:
+        Distance, bearing and standard deviation of distance, ``(n, 3)``, nearest first.
+    """
+    n, m, count, size = rates.shape[0], rates.shape[1], 0, 2 * _WINDOW + 1
+    found = np.empty((n * m // 4 + n + m, 3))  # maxima touch only where they are equal
+    patch, by_a, by_d = np.empty((size, size)), np.empty(size), np.empty(size)
+    for k in range(n):
+        for d in range(m):
+            here, is_peak = rates[k, d], rates[k, d] > lowest
+            for i in range(-1, 2):
+                for j in range(max(d - 1, 0), min(d + 2, m)):
+                    is_peak &= here >= rates[(k + i) % n, j]
+            if not is_peak or count == found.shape[0]:
+                continue
+            for i in range(size):
+                row = (k + i - _WINDOW) % n
+                for j in range(size):
+                    column = d + j - _WINDOW
+                    patch[i, j] = rates[row, column] if 0 <= column < m else 0.0
+            to_a = to_d = spread = 0.0
+            for _ in range(_ROUNDS):
+                total = mean_a = mean_d = spread = 0.0
+                for j in range(size):
+                    off = j - _WINDOW - to_d
+                    by_d[j] = math.exp(-0.5 * (off / sigmas[1]) ** 2)
+                    off = j - _WINDOW - to_a
+                    by_a[j] = math.exp(-0.5 * (off / sigmas[0]) ** 2)
+                for i in range(size):
+                    for j in range(size):
+                        weight = patch[i, j] * by_a[i] * by_d[j]
+                        total += weight
+                        mean_a += weight * (i - _WINDOW)
+                        mean_d += weight * (j - _WINDOW)
+                mean_a, mean_d = mean_a / total, mean_d / total
+                for i in range(size):
+                    for j in range(size):
+                        off = j - _WINDOW - mean_d
+                        spread += patch[i, j] * by_a[i] * by_d[j] * off * off
+                spread /= total
+                to_a = min(max(to_a + 2.0 * (mean_a - to_a), -1.0), 1.0)
+                to_d = min(max(to_d + 2.0 * (mean_d - to_d), -1.0), 1.0)
+            distance = beta_m * math.expm1((warped_m[d] + to_d * step_m) / beta_m)
+            distance = max(distance, 0.0)
+            angle = (bearings_rad[k] + to_a * (TWO_PI / n)) % TWO_PI
+            square = sigmas[1] * sigmas[1]
+            narrow = 1.0 / (1.0 / min(spread, 0.99 * square) - 1.0 / square)
+            at = count
+            while at > 0 and found[at - 1, 0] > distance:
+                for i in range(3):
+                    found[at, i] = found[at - 1, i]
+                at -= 1
+            found[at, 0], found[at, 1] = distance, angle
+            found[at, 2] = math.sqrt(narrow) * step_m * (distance / beta_m + 1.0)
+            count += 1
+    return found[:count]
+
+
 class BoundarySheet(nn.Module):
     r"""Boundary cells on a ring of bearings and an axis of warped distances.
 
@@ -111,6 +220,7 @@ class BoundarySheet(nn.Module):
     def __init__(self, config: BoundaryCellConfig) -> None:
         super().__init__()
         self.config = c = config
+        self._kept: tuple[Any, ...] | None = None
         kind = torch.float64
         self.step_m = c.sigma_m / _CELLS_PER_SIGMA
         low = _MARGIN * min(c.sigma_m, c.beta_m / (_MARGIN + 1.0))
@@ -162,9 +272,30 @@ class BoundarySheet(nn.Module):
                 none.
             bearing_rad: Its bearing, the same shape.
         """
+        if distance_m.dim() == 1 and runs_compiled(distance_m, bearing_rad, self.warped_m):
+            felt_m = distance_m.to(self.warped_m).contiguous().numpy()
+            felt_rad = bearing_rad.to(self.warped_m).contiguous().numpy()
+            return torch.from_numpy(respond_step(felt_m, felt_rad, *self._numbers()))
         axes = self.bearings_rad, self.warped_m
         walls = distance_m.to(self.warped_m), bearing_rad.to(self.warped_m)
         return self.interact(warped_tuning(*walls, axes, self.config))
+
+    def _numbers(self) -> tuple[Any, ...]:
+        """Return what :func:`respond_step` takes besides walls."""
+        if self._kept is None:
+            c = self.config
+            names = ("excite_matrix_0", "excite_matrix_1", "inhibit_matrix_0", "inhibit_matrix_1")
+            self._kept = (
+                self.bearings_rad.numpy(), self.warped_m.numpy(),
+                (c.sheet_sigma_bearing_rad, c.sigma_m), c.beta_m,
+                (c.sheet_excitation, c.sheet_inhibition),
+                *(self.get_buffer(f"_{name}").contiguous().numpy() for name in names),
+            )  # fmt: skip
+        return self._kept
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Self:  # noqa: ANN401 - as nn.Module has it
+        self._kept = None
+        return super()._apply(fn, recurse)
 
     def tuned(self, distance_m: Tensor, bearing_rad: Tensor) -> Tensor:
         """Return the raster convolved with the tuning kernel; equal to :func:`warped_tuning`.
@@ -263,8 +394,15 @@ class BoundarySheet(nn.Module):
             Distance in metres (``inf`` for none), bearing in radians in [0, 2 pi), and standard
             deviation of distance in metres, ``([batch,] n)`` each, nearest first.
         """
-        batch = rates if rates.dim() == 3 else rates[None]
         lowest = self.config.sheet_share * (self.clear if clear is None else clear)
+        if rates.dim() == 2 and runs_compiled(rates) and rates.dtype == torch.float64:
+            axes, beta_m = self._numbers()[:2], self.config.beta_m
+            found = read_step(
+                rates.contiguous().numpy(), lowest, self.sigmas, self.step_m, beta_m, *axes
+            )
+            distance, bearing, width = torch.from_numpy(found.T.copy())
+            return distance, bearing, width
+        batch = rates if rates.dim() == 3 else rates[None]
         w = _WINDOW
         padded = F.pad(F.pad(batch, (0, 0, w, w), mode="circular"), (w, w))
         inner = padded[:, w - 1 : 1 - w, w - 1 : 1 - w].unsqueeze(1)

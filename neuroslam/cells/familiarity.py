@@ -1,13 +1,16 @@
 """Familiarity: the walls known at each place cell, and whether the present ones contradict them."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.geometry import TWO_PI
-from neuroslam.state.mergeable import BufferModule, without_gradients
+from neuroslam.state.mergeable import Arrays, BufferModule, without_gradients
 
 SURE = 0.6
 """Share of the reach within which a wall is always sensed."""
@@ -46,6 +49,51 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
         none.scatter_reduce(1, bins, (distance_m < reach_m).to(none), "amax"),
         none.scatter_reduce(1, bins, (distance_m < SURE * reach_m).to(none), "amax"),
     )
+
+
+@compiled
+def compare_step(
+    winner: int, distance_m: np.ndarray, bearing_rad: np.ndarray, error_rad: float,
+    against: bool, supports: bool, dt_s: float, reach_m: float, lost_after_s: float,
+    felt_s: np.ndarray, time_s: np.ndarray, doubt_s: np.ndarray, lost: np.ndarray,
+    slack: np.ndarray,
+) -> None:  # fmt: skip
+    """Do as :meth:`Familiarity.forward` for one animal, in place.
+
+    The walls' bearings are those in the world, and have the compass error ``error_rad`` yet.
+    """
+    n, cell = slack.shape[0], max(winner, 0)
+    felt = np.zeros((2, n), np.float32)
+    for w in range(distance_m.shape[0]):
+        k = round((bearing_rad[w] - error_rad) * (n / TWO_PI)) % n
+        away = np.float32(distance_m[w])
+        if away < np.float32(reach_m):
+            felt[0, k] = 1.0
+        if away < np.float32(SURE * reach_m):
+            felt[1, k] = 1.0
+    time = time_s[0, cell]
+    total = max(time, np.float32(1e-9))
+    differs = False
+    for i in range(n):
+        ever = around = np.float32(0.0)
+        for k in range(n):
+            ever += felt_s[0, cell, 0, k] / total * slack[k, i]
+            around += felt[0, k] * slack[k, i]
+        differs |= felt[1, i] > 0.0 and ever < np.float32(_NEVER)
+        always = felt_s[0, cell, 1, i] / total
+        differs |= always > np.float32(_ALWAYS) and around == 0.0
+    contradicted = against or (differs and time > np.float32(_FAMILIAR_S) and winner >= 0)
+    agrees = supports and not contradicted
+    doubt = doubt_s[0] + np.float32(dt_s) * (
+        np.float32(contradicted) - np.float32(_FORGIVES) * np.float32(agrees)
+    )
+    doubt_s[0] = min(max(doubt, np.float32(0.0)), np.float32(_MOST * lost_after_s))
+    lost[0] = doubt_s[0] > (0.0 if lost[0] else np.float32(lost_after_s))
+    if winner >= 0 and not contradicted and not lost[0]:
+        time_s[0, cell] += np.float32(dt_s)
+        for side in range(2):
+            for k in range(n):
+                felt_s[0, cell, side, k] += felt[side, k] * np.float32(dt_s)
 
 
 class Familiarity(BufferModule):
@@ -130,6 +178,23 @@ class Familiarity(BufferModule):
         self.time_s[rows, cell] = time + sure
         self.felt_s[rows, cell] += torch.stack(felt, dim=1) * sure[:, None, None]
         return self.lost
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether one animal is lost."""
+        return bool(self.lost[0])
+
+    def compare_compiled(
+        self, winner: int, distance_m: np.ndarray, bearing_rad: np.ndarray, error_rad: float,
+        evidence: Sequence[bool], dt_s: float,
+    ) -> None:  # fmt: skip
+        """Do as :meth:`forward` for one animal, by bearings not less the compass error."""
+        self._make_room(winner)
+        against, supports = evidence
+        compare_step(
+            winner, distance_m, bearing_rad, error_rad, against, supports, dt_s,
+            self.config.reach_m, self.lost_after_s, *cast(Arrays, self.arrays()),
+        )  # fmt: skip
 
     def n_activated(self) -> Tensor:
         """Count, for each animal, pairs of a place cell and a boundary cell active at it."""

@@ -1,13 +1,17 @@
 """Grid cells: a lateral anti-Hebbian network (LAHN) that learns hexagons from phases."""
 
-from typing import NamedTuple
+import math
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.cells.convolve import convolve_axes, gaussian_difference
 from neuroslam.cells.oscillators import wave_vectors
+from neuroslam.compiled import compiled
 from neuroslam.config import GridCellConfig
-from neuroslam.state.mergeable import BufferModule
+from neuroslam.state.mergeable import Arrays, BufferModule
 
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0
@@ -50,6 +54,46 @@ def lahn_drive(inputs: Tensor, rates: Tensor, feedforward: Tensor, lateral: Tens
     return drive.transpose(0, 1).reshape(rates.shape)
 
 
+def sheet_of(n_cells: int) -> tuple[int, int]:
+    """Return rows and columns of the torus on which the cells of a module lie, nearly a square.
+
+    Example:
+        >>> sheet_of(24), sheet_of(7)
+        ((4, 6), (1, 7))
+    """
+    rows = max(d for d in range(1, math.isqrt(n_cells) + 1) if n_cells % d == 0)
+    return rows, n_cells // rows
+
+
+def lateral_kernel(config: GridCellConfig) -> Tensor:
+    r"""Return the weights by which the cells of a module excite and inhibit each other.
+
+    .. math:: K * r = g_E \, G_E * r - g_I \, G_I * r
+
+    by circular convolution on the sheet of :func:`sheet_of`; as a matrix, for so few cells.
+
+    Args:
+        config: Strengths and widths.
+
+    Returns:
+        ``(n_cells, n_cells)``, ``float64``.
+
+    Example:
+        >>> kernel = lateral_kernel(GridCellConfig(n_cells=24))
+        >>> kernel[0].argmax().item(), kernel.sum().abs().item() < 1e-9
+        (0, True)
+    """
+    c, sizes = config, sheet_of(config.n_cells)
+    odd = [size - 1 + size % 2 for size in sizes]
+    kernels = gaussian_difference(
+        [(min(5, size), c.excitation_cells) for size in odd],
+        [(size, c.inhibition_cells) for size in odd],
+    )
+    each = torch.eye(c.n_cells, dtype=torch.float64).reshape(-1, *sizes)
+    near, far = (convolve_axes(each, kernel) for kernel in kernels)
+    return (c.excitation * near - c.inhibition * far).flatten(1).T.contiguous()
+
+
 def lahn_learn(
     inputs: Tensor, drive: Tensor, weights: LAHNWeights, config: GridCellConfig
 ) -> LAHNWeights:
@@ -89,13 +133,44 @@ def lahn_learn(
     return LAHNWeights(q, w, threshold, bias)
 
 
+@compiled
+def rates_step(
+    phases: np.ndarray, feedforward: np.ndarray, lateral: np.ndarray, bias: np.ndarray,
+    rates: np.ndarray,
+) -> None:  # fmt: skip
+    """Compute the rates of one animal from :func:`lahn_drive`, in place."""
+    n_modules, n_cells, n_inputs = feedforward.shape
+    x = np.empty(n_inputs, np.float32)
+    before = np.empty(n_cells, np.float32)
+    for m in range(n_modules):
+        for k in range(n_inputs):
+            x[k] = phases[m, k // 2, k % 2]
+        for i in range(n_cells):
+            before[i] = rates[m, i]
+        for i in range(n_cells):
+            drive = np.float32(0.0)
+            for k in range(n_inputs):
+                drive += feedforward[m, i, k] * x[k]
+            # Four sums side by side: each alone would wait for its last addition.
+            a = b = c = d = np.float32(0.0)
+            for k in range(0, n_cells - 3, 4):
+                a += lateral[m, i, k] * before[k]
+                b += lateral[m, i, k + 1] * before[k + 1]
+                c += lateral[m, i, k + 2] * before[k + 2]
+                d += lateral[m, i, k + 3] * before[k + 3]
+            for k in range(n_cells - n_cells % 4, n_cells):
+                a += lateral[m, i, k] * before[k]
+            rates[m, i] = max(drive + ((a + b) + (c + d)) - bias[m, i], np.float32(0.0))
+
+
 class LAHNGridCells(BufferModule):
     """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
 
-    :func:`lahn_drive` and :func:`lahn_learn` have the mathematics. A network is made with weights
-    that developed at random positions, without an environment; ``learn`` continues from there.
-    State: the parameters ``feedforward`` and ``lateral``, the buffers ``threshold``, ``bias`` and
-    ``rates``, and the generator of its random weights. Animals of a batch share one network.
+    :func:`lahn_drive`, :func:`lateral_kernel` and :func:`lahn_learn` have the mathematics. A
+    network is made with weights that developed at random positions, without an environment;
+    ``learn`` continues from there. State: the parameters ``feedforward`` and ``lateral``, the
+    buffers ``threshold``, ``bias`` and ``rates``, and the generator of its random weights. Animals
+    of a batch share one network.
 
     Args:
         config: Modules, cells, learning rates.
@@ -112,6 +187,7 @@ class LAHNGridCells(BufferModule):
     threshold: Tensor
     bias: Tensor
     rates: Tensor
+    kernel: Tensor
     generator_state: Tensor
 
     def __init__(self, config: GridCellConfig, batch: int | None = None) -> None:
@@ -133,6 +209,8 @@ class LAHNGridCells(BufferModule):
         self.register_buffer("bias", weights.bias)
         lead = () if batch is None else (batch,)
         self.register_buffer("rates", torch.zeros(*lead, m, n))
+        kernel = lateral_kernel(config).to(weights.bias)
+        self.register_buffer("kernel", kernel, persistent=False)
         self.register_buffer("generator_state", generator.get_state())
         self._develop_once()
 
@@ -152,6 +230,13 @@ class LAHNGridCells(BufferModule):
     def weights(self) -> LAHNWeights:
         """The learnt weights."""
         return LAHNWeights(self.feedforward, self.lateral, self.threshold, self.bias)
+
+    @property
+    def coupling(self) -> Tensor:
+        """Lateral weights in use, ``(n_modules, n_cells, n_cells)``: learned, a kernel, or both."""
+        if self.config.lateral == "kernel":
+            return self.kernel.expand_as(self.lateral)
+        return self.lateral if self.config.lateral == "learned" else self.lateral + self.kernel
 
     @torch.no_grad()
     def develop(self, steps: int) -> None:
@@ -174,11 +259,13 @@ class LAHNGridCells(BufferModule):
     @torch.no_grad()
     def learn(self, inputs: Tensor) -> None:
         """Learn from inputs, ``(samples, n_modules, 2 * directions)``, at settled rates."""
-        q, w, _, bias = self.weights
+        q, _, _, bias = self.weights
         rates = (inputs.unsqueeze(-2) @ q.mT).squeeze(-2).sub(bias).clamp_min(0.0)
-        learnt = lahn_learn(inputs, lahn_drive(inputs, rates, q, w), self.weights, self.config)
+        drive = lahn_drive(inputs, rates, q, self.coupling)
+        learnt = lahn_learn(inputs, drive, self.weights, self.config)
         self.feedforward.copy_(learnt.feedforward)
-        self.lateral.copy_(learnt.lateral)
+        if self.config.lateral != "kernel":
+            self.lateral.copy_(learnt.lateral)
         self.threshold, self.bias = learnt.threshold, learnt.bias
 
     def forward(self, phases: Tensor) -> Tensor:
@@ -191,10 +278,20 @@ class LAHNGridCells(BufferModule):
             ``([batch,] n_modules, n_cells)``, non-negative.
         """
         inputs = phases.flatten(-2).to(self.bias.dtype)
-        drive = lahn_drive(inputs, self.rates, self.feedforward, self.lateral)
+        drive = lahn_drive(inputs, self.rates, self.feedforward, self.coupling)
         rates = (drive - self.bias).clamp_min(0.0)
         self.rates = rates.detach()
         if self.config.learns_online:
             with torch.no_grad():
                 self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]))
+        return rates
+
+    def rates_compiled(self, phases: np.ndarray) -> np.ndarray:
+        """Do as :meth:`forward` for one animal, in place."""
+        feedforward, lateral, _, bias, rates, *_ = cast(Arrays, self.arrays())
+        if self.config.lateral != "learned":
+            lateral = self.coupling.detach().contiguous().numpy()
+        rates_step(phases, feedforward, lateral, bias, rates)
+        if self.config.learns_online:
+            self.learn(torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)[None])
         return rates

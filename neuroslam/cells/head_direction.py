@@ -17,6 +17,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neuroslam.cells.convolve import ring_convolve
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BrainConfig, Section
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
@@ -271,6 +272,76 @@ def decode_heading(activity: Tensor, ring: Ring) -> Tensor:
     return torch.atan2(y, x)
 
 
+@compiled
+def turn_step(
+    activity: np.ndarray, turn_rad: float, settle_share: float, order: np.ndarray,
+    kernels: np.ndarray, gain: float, exponent: float,
+) -> np.ndarray:  # fmt: skip
+    """Do as :func:`ring_step` for one ring; return the new activity."""
+    n = activity.shape[0]
+    both = np.zeros(2 * n)
+    half = order.shape[0] // 2
+    for k in range(half):  # an even part, and the odd one of the same order
+        even, odd = math.cos(order[k] * turn_rad), math.sin(order[k] * turn_rad)
+        for i in range(2 * n):
+            both[i] += even * kernels[k, i] + odd * kernels[half + k, i]
+    move, drive = np.empty(2 * n), np.empty(2 * n)  # twice around
+    for i in range(n):
+        move[i] = move[n + i] = both[i]
+        drive[i] = drive[n + i] = both[n + i]
+    moved, settled = np.zeros(n), np.zeros(n)
+    for j in range(n):
+        rate = activity[j]
+        for i in range(n):
+            moved[i] += rate * move[n - j + i]
+            settled[i] += rate * drive[n - j + i]
+    total = 0.0
+    for i in range(n):
+        steep = settled[i] * gain
+        rate = settled[i] if steep > 20.0 else math.log1p(math.exp(steep)) / gain
+        rate = rate * rate if exponent == 2.0 else rate**exponent
+        settled[i] = rate
+        total += rate
+    mass = 0.0
+    for i in range(n):
+        moved[i] = max(moved[i] + settle_share * (settled[i] / total - moved[i]), 0.0)
+        mass += moved[i]
+    for i in range(n):
+        moved[i] /= mass
+    return moved
+
+
+@compiled
+def inject_step(
+    activity: np.ndarray, heading_rad: float, share: float, order: np.ndarray, bump: np.ndarray
+) -> np.ndarray:
+    """Do as :func:`inject` for one ring; return the new activity."""
+    n = activity.shape[0]
+    cue, mixed = np.zeros(n), np.empty(n)
+    half = order.shape[0] // 2
+    for k in range(half):
+        even, odd = math.cos(order[k] * heading_rad), math.sin(order[k] * heading_rad)
+        for i in range(n):
+            cue[i] += even * bump[k, i] + odd * bump[half + k, i]
+    for i in range(n):
+        mixed[i] = activity[i] + share * (cue[i] - activity[i])
+    return mixed
+
+
+@compiled
+def decode_step(activity: np.ndarray, windows: np.ndarray) -> float:
+    """Do as :func:`decode_heading` for one ring."""
+    peak, x, y = 0, 0.0, 0.0
+    for i in range(activity.shape[0]):
+        if activity[i] > activity[peak]:
+            peak = i
+    for i in range(activity.shape[0]):
+        weight = activity[i] * activity[i]
+        x += windows[peak, 0, i] * weight
+        y += windows[peak, 1, i] * weight
+    return math.atan2(y, x)
+
+
 def _waves(ring: Ring, angle_rad: float | Tensor) -> Tensor:
     """Return cosines, then sines, of the multiples of an angle, shape ``(..., 2 K)``."""
     if isinstance(angle_rad, Tensor):
@@ -385,6 +456,7 @@ class HeadDirectionCells(Population):
         self.views = GrowingTable({"heading_rad": ((), torch.float64)})
         self.last = LastView()
         self._decoded: tuple[Tensor | None, float | Tensor] = (None, 0.0)
+        self._arrays_of: tuple[Ring | None, tuple[np.ndarray, ...]] = (None, ())
         self.register_load_state_dict_post_hook(_forget_decoded)
 
     @property
@@ -392,10 +464,26 @@ class HeadDirectionCells(Population):
         """Heading in radians, in [-pi, pi); in a batch ``(batch,)``."""
         activity, heading = self._decoded
         if activity is not self.activity:
-            heading = decode_heading(self.activity, self.ring)
-            heading = wrap_angle(heading.item()) if self.batch is None else heading
+            if self._compiles():
+                heading = wrap_angle(decode_step(self.activity.numpy(), self._ring_arrays()[4]))
+            else:
+                heading = decode_heading(self.activity, self.ring)
+                heading = wrap_angle(heading.item()) if self.batch is None else heading
             self._decoded = self.activity, heading
         return heading
+
+    def _compiles(self) -> bool:
+        """Return whether steps of this ring are compiled."""
+        activity = self.activity
+        return self.batch is None and activity.dtype == torch.float64 and runs_compiled(activity)
+
+    def _ring_arrays(self) -> tuple[np.ndarray, ...]:
+        """Return order, quarter, kernels, bump and windows of the ring as arrays."""
+        ring, arrays = self._arrays_of
+        if ring is not self.ring:
+            arrays = tuple(part.numpy() for part in self.ring[:5])
+            self._arrays_of = self.ring, arrays
+        return arrays
 
     @property
     def preferred_rad(self) -> np.ndarray:
@@ -441,7 +529,16 @@ class HeadDirectionCells(Population):
         dt = motion.dt_s
         turn = motion.w_rad_s * dt
         share = -math.expm1(-dt / self.config.settle_s)
-        self.activity = ring_step(self.activity, turn, share, self.ring)
+        if self._compiles():
+            order, _, kernels, *_ = self._ring_arrays()
+            self.activity = torch.from_numpy(
+                turn_step(
+                    self.activity.numpy(), float(turn), share, order, kernels,
+                    self.ring.gain, self.ring.exponent,
+                )
+            )  # fmt: skip
+        else:
+            self.activity = ring_step(self.activity, turn, share, self.ring)
         if compass is None:
             return 0.0
         if not self.last.anchored:
@@ -458,7 +555,12 @@ class HeadDirectionCells(Population):
         """
         share = -math.expm1(-dt_s / time_s)
         before = cast(float, self.heading_rad) if self.batch is None else 0.0
-        self.activity = inject(self.activity, heading_rad, share, self.ring)
+        if self._compiles():
+            order, _, _, bump, _ = self._ring_arrays()
+            mixed = inject_step(self.activity.numpy(), float(heading_rad), share, order, bump)
+            self.activity = torch.from_numpy(mixed)
+        else:
+            self.activity = inject(self.activity, heading_rad, share, self.ring)
         return wrap_angle(cast(float, self.heading_rad) - before) if self.batch is None else 0.0
 
     def update_from_view(self, view: ViewMatch, dt_s: float) -> float:

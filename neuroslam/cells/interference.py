@@ -4,9 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
 
@@ -74,6 +76,42 @@ def interference(
     crest = 0.5 * (torch.cos(theta_rad[..., None] + phase_rad) + torch.cos(theta_rad)[..., None])
     met = crest.prod(-1) if combine == "product" else crest.mean(-1)
     return (met - threshold).clamp_min(0.0) / (1.0 - threshold)
+
+
+@compiled
+def interference_step(
+    phase_rad: np.ndarray, velocity_m_s: np.ndarray, waves_rad_m: np.ndarray, dt_s: float,
+    offset_rad: np.ndarray, theta_rad: np.ndarray, product: bool, threshold: float,
+    rates: np.ndarray,
+) -> None:  # fmt: skip
+    """Do as :func:`phase_step` for one animal, in place; write the rates of :func:`interference`.
+
+    Several phases of theta, ``(n,)``, give the mean rate over them.
+    """
+    n_modules, n_cells, n_waves = offset_rad.shape
+    n_thetas = theta_rad.shape[0]
+    crests, troughs = np.empty(n_thetas), np.empty(n_thetas)
+    for k in range(n_thetas):
+        crests[k], troughs[k] = math.cos(theta_rad[k]), math.sin(theta_rad[k])
+    for m in range(n_modules):
+        for j in range(n_waves):
+            along = velocity_m_s[0] * waves_rad_m[m, j, 0] + velocity_m_s[1] * waves_rad_m[m, j, 1]
+            phase_rad[m, j] = (phase_rad[m, j] + along * dt_s) % TWO_PI
+    c, s = np.empty(n_waves), np.empty(n_waves)
+    for m in range(n_modules):
+        for i in range(n_cells):
+            for j in range(n_waves):
+                phase = phase_rad[m, j] - offset_rad[m, i, j]
+                c[j], s[j] = 1.0 + math.cos(phase), math.sin(phase)
+            total = 0.0
+            for k in range(n_thetas):
+                met, mean = 1.0, 0.0
+                for j in range(n_waves):
+                    crest = 0.5 * (crests[k] * c[j] - troughs[k] * s[j])
+                    met, mean = met * crest, mean + crest
+                met = met if product else mean / n_waves
+                total += max(met - threshold, 0.0)
+            rates[m * n_cells + i] = total / (1.0 - threshold) / n_thetas
 
 
 def lattice_waves(orientation_rad: Tensor, directions: int) -> Tensor:
@@ -216,10 +254,31 @@ class OscillatoryInterference(nn.Module):
             MapError: If the velocity has another shape or is not finite, or time runs backward.
         """
         velocity = checked_velocity(self, velocity_m_s, dt_s, self.batch).to(self.phase_rad)
+        if self._compiles(velocity):
+            return self._step(velocity, dt_s)
         self.phase_rad = phase_step(self.phase_rad, velocity, self.waves_rad_m, dt_s)
         if self.theta_hz is not None:
             self.theta_rad = torch.remainder(self.theta_rad + TWO_PI * self.theta_hz * dt_s, TWO_PI)
         return self.rates
+
+    def _compiles(self, velocity: Tensor) -> bool:
+        state = (velocity, self.phase_rad, self.spacings_m, self.offset_rad)
+        return self.batch is None and velocity.dtype == torch.float64 and runs_compiled(*state)
+
+    def _step(self, velocity: Tensor, dt_s: float) -> Tensor:
+        """Do as :meth:`forward` for one animal by a compiled step."""
+        waves, theta = self.waves_rad_m.contiguous().numpy(), np.arange(_CYCLE) * (TWO_PI / _CYCLE)
+        self.phase_rad = phase = self.phase_rad.clone(memory_format=torch.contiguous_format)
+        if self.theta_hz is not None:
+            self.theta_rad = torch.remainder(self.theta_rad + TWO_PI * self.theta_hz * dt_s, TWO_PI)
+            theta = self.theta_rad.reshape(1).numpy()
+        rates = np.empty(self.n_cells)
+        interference_step(
+            phase.numpy(), velocity.contiguous().numpy(), waves, dt_s,
+            self.offset_rad.contiguous().numpy(), theta, self.combine == "product",
+            self.threshold, rates,
+        )  # fmt: skip
+        return torch.from_numpy(rates)
 
 
 def checked_velocity(

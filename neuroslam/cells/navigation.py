@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.wall_matching import match_walls, outline_of
 from neuroslam.cells.walls import WallMemory
+from neuroslam.compiled import runs_compiled
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import wrap_angle
@@ -105,6 +106,7 @@ class NavigationCells(Population):
         self.familiarity = Familiarity(
             config.boundary_cells, config.wall_memory.lost_after_s, batch
         )
+        self._senses = cells_sense
         self.now = NavigationState(config.map.initial_heading_deg)
         # Pose at which each view was learnt; ``sure`` is 0 if the animal was lost.
         self.seen = GrowingTable(
@@ -140,8 +142,12 @@ class NavigationCells(Population):
         """
         if wall_m.shape != wall_bearing_rad.shape:
             check_walls(wall_m, wall_bearing_rad)
-        if not 0.0 <= dt_s < math.inf:  # NaN too
-            raise BadFrame(f"time since the last step is {dt_s} s; expected 0 or more")
+        _check_duration(dt_s)
+        if self._compiles() and runs_compiled(wall_m):
+            felt_m = np.ascontiguousarray(wall_m.numpy(), np.float64)
+            felt_rad = np.ascontiguousarray(wall_bearing_rad.numpy(), np.float64)
+            speed, heading = float(speed_m_s), float(heading_rad)
+            return self._step(speed, heading, dt_s, felt_m, felt_rad, compass, read)
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -189,6 +195,67 @@ class NavigationCells(Population):
             lost if self.batch is not None else lost[0],
         )
 
+    def _compiles(self) -> bool:
+        """Return whether the steps of this process and of these cells are compiled."""
+        return self.batch is None and runs_compiled(self.walls.errors)
+
+    def _step(
+        self,
+        speed_m_s: float,
+        heading_rad: float,
+        dt_s: float,
+        wall_m: np.ndarray,
+        wall_bearing_rad: np.ndarray,
+        compass: bool,
+        read: bool = False,
+    ) -> NavigationEstimate:
+        """Do as :meth:`forward` for one animal by compiled steps."""
+        boundary, memory, oscillators = self.boundary, self.walls, self.oscillators
+        grid, place, familiarity = self.grid, self.place, self.familiarity
+        nearest, bearing = boundary.respond_compiled(
+            speed_m_s, heading_rad, wall_m, wall_bearing_rad, dt_s
+        )
+        now, corrects = self.now, self.config.wall_memory.corrects
+        learns = not (now.someone_lost and familiarity.is_lost)
+        dx, dy = memory.move_compiled(speed_m_s, heading_rad, dt_s)
+        since_s = now.since_s + dt_s
+        compares = since_s >= FAMILIARITY_PERIOD_S
+        corrects_now = corrects and nearest < math.inf and memory.is_due
+        if self._senses and not read and nearest < math.inf and (compares or corrects_now):
+            wall_m, bearing = self._read_sheet(wall_m, bearing)
+            corrects_now = corrects_now and len(wall_m) > 0
+        correction = np.zeros(2)
+        if corrects_now:
+            x, y = oscillators.decode_compiled().tolist()
+            start = np.array([x + dx, y + dy])
+            end = start.copy()
+            memory.update_compiled(end, wall_m, bearing, compass=compass, learns=learns)
+            correction = end - start
+            off_x, off_y = correction.tolist()
+            dx, dy = dx + off_x, dy + off_y
+        phases, position = oscillators.shift_compiled(dx, dy)
+        rates = grid.rates_compiled(phases)
+        winner, recruited = place.compete_compiled(
+            rates, position, dt_s, learns if now.someone_lost else None
+        )
+        if compares:
+            sure_m = SURE * self.config.boundary_cells.reach_m
+            *evidence, error = memory.evidence_compiled(position, wall_m, bearing, sure_m)
+            familiarity.compare_compiled(winner, wall_m, bearing, error, evidence, since_s)
+            if not corrects:  # walls that do not correct do not contradict
+                familiarity.reset_doubt()
+            now.someone_lost = int(familiarity.is_lost)
+            now.lost_s += since_s * now.someone_lost
+            since_s = 0.0
+        now.since_s = since_s
+        said = np.array(winner), np.array(recruited), np.array(now.someone_lost > 0)
+        return NavigationEstimate(*map(torch.from_numpy, (position.copy(), correction, *said)))
+
+    def _read_sheet(self, wall_m: np.ndarray, bearing_rad: np.ndarray) -> list[np.ndarray]:
+        sheet = cast(BoundarySheet, self.sheet)
+        rates = sheet(torch.from_numpy(wall_m), torch.from_numpy(bearing_rad))
+        return [part.numpy() for part in sheet.read(rates)[:2]]
+
     def _uses_walls(self, dt_s: float) -> bool:
         """Return whether walls are used in this step: to correct, or to compare."""
         corrects = self.walls.is_due and self.config.wall_memory.corrects
@@ -210,10 +277,11 @@ class NavigationCells(Population):
 
     def step(self, now: StepInput, observation: np.ndarray | None) -> Correction:
         """Advance by a frame of the brain; return the walls' correction of position and heading."""
-        error = self.heading_error_rad
-        self._estimate = self.advance(now.motion, now.compass_rad, observation)
+        before = self.heading_error_rad
+        self._estimate = self._advance(now.motion, now.compass_rad, observation)
         dx, dy = self._estimate.correction_m.tolist()
-        return Correction(dx, dy, error - self.heading_error_rad, self.pose.theta_rad)
+        error = self.heading_error_rad
+        return Correction(dx, dy, before - error, wrap_angle(self.now.heading_rad - error))
 
     def advance(
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
@@ -228,26 +296,38 @@ class NavigationCells(Population):
         Raises:
             BadFrame: If a number is invalid; nothing has changed then.
         """
+        return self._advance(motion, compass_rad, None if walls is None else checked_walls(walls))
+
+    def _advance(
+        self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
+    ) -> NavigationEstimate:
+        """Do as :meth:`advance` by walls that were checked."""
         now, compass = self.now, compass_rad is not None
         if compass_rad is not None:
             heading = wrap_angle(checked_number(compass_rad, "heading", "rad") + now.turned_rad)
         else:
             heading = wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
-        felt = torch.empty((0, 2), dtype=torch.float64)
-        if walls is not None:
-            felt = torch.from_numpy(checked_walls(walls).copy())
-            felt = felt[felt[:, 0].argsort()]
-        device = self.walls.errors.device
-        numbers = torch.tensor([motion.v_m_s, heading], dtype=torch.float64, device=device)
-        felt = felt.to(device)
-        here = self(*numbers, motion.dt_s, felt[:, 0], felt[:, 1], compass=compass)
+        felt = np.empty((0, 2)) if walls is None else walls[walls[:, 0].argsort(kind="stable")]
+        wall_m, bearing = felt.T.copy()
+        if self._compiles():
+            _check_duration(motion.dt_s)
+            with torch.inference_mode():
+                here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
+        else:
+            columns = ([motion.v_m_s, heading], wall_m, bearing)
+            device = self.walls.errors.device
+            (speed, course), *felt_walls = (
+                torch.as_tensor(column, dtype=torch.float64, device=device) for column in columns
+            )
+            here = self(speed, course, motion.dt_s, *felt_walls, compass=compass)
         now.heading_rad, now.compass = heading, int(compass)
         return here
 
     @property
     def heading_error_rad(self) -> float:
         """Learnt error of the measured heading of one animal, which is subtracted from it."""
-        return self.walls.errors[0, 1].item()
+        arrays = self.walls.arrays()  # of torch a number takes longer
+        return float((self.walls.errors if arrays is None else arrays[4])[0, 1])
 
     @property
     def pose(self) -> Pose:
@@ -467,3 +547,8 @@ class NavigationCells(Population):
         compass = all(cells.now.compass for cells in both)
         one, other = (outline_of(*cells.walls.remembered()[0][:4]) for cells in both)
         return match_walls((one, other), maps, config, compass=compass)
+
+
+def _check_duration(dt_s: float) -> None:
+    if not 0.0 <= dt_s < math.inf:  # NaN too
+        raise BadFrame(f"time since the last step is {dt_s} s; expected 0 or more")

@@ -1,12 +1,15 @@
 """Velocity-controlled oscillators: phases that advance with displacement along a direction."""
 
 import math
+from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import compiled
 from neuroslam.config import GridCellConfig
-from neuroslam.state.mergeable import BufferModule
+from neuroslam.state.mergeable import Arrays, BufferModule
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
@@ -91,6 +94,43 @@ def decode_phases(waves: Tensor, solver: Tensor, phases: Tensor, near_m: Tensor)
     return near_m + z.angle().flatten(-2) @ solver.mT
 
 
+@compiled
+def shift_step(
+    dx_m: float, dy_m: float, waves: np.ndarray, phases: np.ndarray, position_m: np.ndarray
+) -> None:
+    """Do as :func:`turn_phases` for one animal, in place, and move its position."""
+    for m in range(waves.shape[0]):
+        for j in range(waves.shape[1]):
+            angle = waves[m, j, 0] * dx_m + waves[m, j, 1] * dy_m
+            c, s = math.cos(angle), math.sin(angle)
+            x, y = phases[m, j, 0], phases[m, j, 1]
+            phases[m, j, 0] = x * c - y * s
+            phases[m, j, 1] = x * s + y * c
+    position_m[0] += dx_m
+    position_m[1] += dy_m
+
+
+@compiled
+def decode_step(
+    waves: np.ndarray, solver: np.ndarray, phases: np.ndarray, position_m: np.ndarray
+) -> None:
+    """Do as :func:`restore_amplitude` and :func:`decode_phases` for one animal, in place."""
+    to_x, to_y, directions = 0.0, 0.0, waves.shape[1]
+    for m in range(waves.shape[0]):
+        for j in range(directions):
+            x, y = phases[m, j, 0], phases[m, j, 1]
+            length = 1.5 - 0.5 * (x * x + y * y)
+            x, y = x * length, y * length
+            phases[m, j, 0], phases[m, j, 1] = x, y
+            angle = -(waves[m, j, 0] * position_m[0] + waves[m, j, 1] * position_m[1])
+            c, s = math.cos(angle), math.sin(angle)
+            off = math.atan2(x * s + y * c, x * c - y * s)
+            to_x += solver[0, m * directions + j] * off
+            to_y += solver[1, m * directions + j] * off
+    position_m[0] += to_x
+    position_m[1] += to_y
+
+
 class VelocityOscillators(BufferModule):
     """Modules of oscillators whose phases integrate motion; state: ``phases`` and ``position_m``.
 
@@ -126,6 +166,7 @@ class VelocityOscillators(BufferModule):
         self.register_buffer("phases", start)
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
         self._waves: tuple[int, Tensor, Tensor] | None = None  # follow from the spacings
+        self._wave_arrays: tuple[Tensor, np.ndarray, np.ndarray] | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module._forget_waves())
 
     @property
@@ -176,6 +217,24 @@ class VelocityOscillators(BufferModule):
         self.phases = restore_amplitude(self.phases).detach()
         self.position_m = decode_phases(waves, solver, self.phases, self.position_m).detach()
         return self.position_m
+
+    def shift_compiled(self, dx_m: float, dy_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Do as :meth:`shift` for one animal, in place; return phases and position."""
+        _, _, phases, position_m = cast(Arrays, self.arrays())
+        shift_step(dx_m, dy_m, self._kept_arrays()[0], phases, position_m)
+        return phases, position_m
+
+    def decode_compiled(self) -> np.ndarray:
+        """Do as :meth:`decode` for one animal, in place; return the position, ``(2,)``."""
+        _, _, phases, position_m = cast(Arrays, self.arrays())
+        decode_step(*self._kept_arrays(), phases, position_m)
+        return position_m
+
+    def _kept_arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        waves, solver = self._kept_waves()
+        if self._wave_arrays is None or self._wave_arrays[0] is not waves:
+            self._wave_arrays = waves, waves.numpy(), np.ascontiguousarray(solver.numpy())
+        return self._wave_arrays[1:]
 
     def place_at(self, position_m: Tensor) -> Tensor:
         """Set the phases to those of a position, ``([batch,] 2)``, and return them."""

@@ -1,12 +1,15 @@
 """Place cells: a competitive Hebbian network on grid cells that recruits cells as it explores."""
 
+import math
 from typing import Any, NamedTuple, Self, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled
 from neuroslam.config import PlaceCellConfig
-from neuroslam.state.mergeable import BufferModule, without_gradients
+from neuroslam.state.mergeable import Arrays, BufferModule, without_gradients
 from neuroslam.state.tables import Scalars
 
 NEIGHBOURS = 12
@@ -62,6 +65,54 @@ def place_response(
     return similarity.pow(power) * (away_m2 * (-0.5 / continuity_m**2)).exp()
 
 
+def excited(response: Tensor, centres_m: Tensor, gain: float, width_m: float) -> Tensor:
+    r"""Let place cells excite each other by a kernel over the distance of their centres.
+
+    .. math:: e_j = p_j + g \sum_k e^{-|X_j - X_k|^2 / 2 s^2} \, p_k
+
+    Cells lie anywhere, so that the convolution is a product with the kernel of their distances.
+
+    Args:
+        response: :math:`p`, ``(..., n)``.
+        centres_m: :math:`X`, ``(..., n, 2)``.
+        gain: :math:`g`.
+        width_m: :math:`s`.
+
+    Returns:
+        ``(..., n)``; for a narrow kernel :math:`(1 + g)\,p`.
+
+    Example:
+        >>> line = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]])
+        >>> excited(torch.tensor([0.0, 1.0, 0.0]), line, 0.5, 0.1).tolist()[1]
+        1.5
+    """
+    squares = (centres_m.unsqueeze(-2) - centres_m.unsqueeze(-3)).square().sum(-1)
+    kernel = (squares * (-0.5 / width_m**2)).exp().to(response)
+    return response + gain * (kernel @ response.unsqueeze(-1)).squeeze(-1)
+
+
+def bump_of(excitation: Tensor, inhibition: float) -> Tensor:
+    r"""Return the bump of place cells that global inhibition leaves, sum 1.
+
+    .. math:: b_j = \frac{[e_j - \varphi \max_k e_k]_+}{\sum_k [e_k - \varphi \max_l e_l]_+}
+
+    The winner is the limit of :math:`\varphi \to 1`.
+
+    Args:
+        excitation: :math:`e`, of :func:`excited`, ``(..., n)``.
+        inhibition: :math:`\varphi`, in [0, 1).
+
+    Returns:
+        ``(..., n)``; zeros where no cell is active.
+
+    Example:
+        >>> bump_of(torch.tensor([0.25, 1.0, 0.75]), 0.5).mul(3).tolist()
+        [0.0, 2.0, 1.0]
+    """
+    left = (excitation - inhibition * excitation.amax(-1, keepdim=True)).clamp_min(0.0)
+    return left / left.sum(-1, keepdim=True).clamp_min(torch.finfo(left.dtype).tiny)
+
+
 def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
     r"""Move the winner's weights towards the grid pattern.
 
@@ -73,6 +124,165 @@ def hebbian_step(weights: Tensor, grid: Tensor, rate: float) -> Tensor:
         [0.707, 0.707]
     """
     return torch.nn.functional.normalize(torch.lerp(weights, grid, rate), dim=-1)
+
+
+@compiled
+def _look_up(x_m: float, y_m: float, n: int, centres_m: np.ndarray, window: np.ndarray) -> None:
+    """Put the cells nearest to a position into the window, in no order."""
+    size = window.shape[1]
+    away = np.empty(size)
+    worst = 0
+    for k in range(max(n, size)):
+        dx, dy = centres_m[0, k, 0] - x_m, centres_m[0, k, 1] - y_m
+        square = dx * dx + dy * dy
+        if k < size:
+            at = k
+        elif square < away[worst]:
+            at = worst
+        else:
+            continue
+        away[at], window[0, at] = square, k
+        if k >= size - 1:
+            worst = 0
+            for j in range(size):
+                if away[j] > away[worst]:
+                    worst = j
+
+
+@compiled
+def _link(start: int, end: int, neighbours: np.ndarray) -> None:
+    """Link a cell to another in a free column, unless they are linked."""
+    for column in range(neighbours.shape[2]):
+        if neighbours[0, start, column] == end:
+            return
+    for column in range(neighbours.shape[2]):
+        if neighbours[0, start, column] == _NO_CELL:
+            neighbours[0, start, column] = end
+            return
+
+
+@compiled
+def _excited(
+    responses: np.ndarray, window: np.ndarray, centres_m: np.ndarray, gain: float, width_m: float
+) -> np.ndarray:
+    """Do as :func:`excited` for the cells of the window."""
+    out = np.empty_like(responses)
+    for j in range(responses.size):
+        total = np.float32(0.0)
+        for k in range(responses.size):
+            if responses[k] > 0.0:
+                dx = centres_m[0, window[0, j], 0] - centres_m[0, window[0, k], 0]
+                dy = centres_m[0, window[0, j], 1] - centres_m[0, window[0, k], 1]
+                kernel = np.float32(math.exp((dx * dx + dy * dy) * (-0.5 / width_m**2)))
+                total += kernel * responses[k]
+        out[j] = responses[j] + np.float32(gain) * total
+    return out
+
+
+@compiled
+def compete_step(
+    resumes: bool, rates: np.ndarray, position_m: np.ndarray, dt_s: float, stay_s: float,
+    learns: int, power: float, continuity_m: float, threshold_m: float, rate: float,
+    excitation: float, excitation_m: float,
+    n_cells: np.ndarray, weights: np.ndarray, centres_m: np.ndarray, visits: np.ndarray,
+    time_s: np.ndarray, neighbours: np.ndarray, winner: np.ndarray, window: np.ndarray,
+    landmarks_m: np.ndarray, leash_m2: np.ndarray,
+) -> int:  # fmt: skip
+    """Do as :meth:`CompetitiveHebbianPlaceCells.forward` for one animal, in place.
+
+    ``resumes`` tells that the table has grown, as the step asked for; ``stay_s`` is the time for
+    which the winner has not changed, and was not credited; ``learns`` is 1 or 0, or -1 if all
+    animals learn; then come numbers of the config, and the state.
+
+    Returns:
+        A sum of: 1 a cell was recruited; 2 the winner changed; 4 the table must grow first.
+    """
+    x, y = position_m[0], position_m[1]
+    if not resumes:
+        if learns >= 0 and winner[0] >= 0:
+            time_s[0, winner[0]] += stay_s
+            time_s[0, winner[0]] += learns * dt_s
+        dx, dy = x - landmarks_m[0, 0, 0], y - landmarks_m[0, 0, 1]
+        if not dx * dx + dy * dy > leash_m2[0, 0]:
+            return 0
+        dx, dy = x - landmarks_m[1, 0, 0], y - landmarks_m[1, 0, 1]
+        if dx * dx + dy * dy > leash_m2[1, 0]:
+            _look_up(x, y, n_cells[0], centres_m, window)
+            landmarks_m[1, 0, 0], landmarks_m[1, 0, 1] = x, y
+        landmarks_m[0, 0, 0], landmarks_m[0, 0, 1] = x, y
+    n_grid, zero = weights.shape[2], np.float32(0.0)
+    grid = np.empty(n_grid, np.float32)
+    squares, k = zero, 0
+    for m in range(rates.shape[0]):
+        for i in range(rates.shape[1]):
+            grid[k] = rates[m, i]
+            squares += grid[k] * grid[k]
+            k += 1
+    norm = max(np.float32(math.sqrt(squares)), np.float32(1e-12))
+    for k in range(n_grid):
+        grid[k] /= norm
+    nearest, far, farthest = np.inf, 0, -1.0
+    responses = np.empty(window.shape[1], np.float32)
+    for k in range(window.shape[1]):
+        cell = window[0, k]
+        dx, dy = centres_m[0, cell, 0] - x, centres_m[0, cell, 1] - y
+        away = dx * dx + dy * dy
+        nearest = min(nearest, away)
+        if away > farthest:
+            far, farthest = k, away
+        a = b = c = d = zero
+        for i in range(0, n_grid - 3, 4):
+            a += weights[0, cell, i] * grid[i]
+            b += weights[0, cell, i + 1] * grid[i + 1]
+            c += weights[0, cell, i + 2] * grid[i + 2]
+            d += weights[0, cell, i + 3] * grid[i + 3]
+        for i in range(n_grid - n_grid % 4, n_grid):
+            a += weights[0, cell, i] * grid[i]
+        similarity = max((a + b) + (c + d), zero)
+        near = math.exp(np.float32(away) * np.float32(-0.5 / continuity_m**2))
+        responses[k] = np.float32(similarity ** np.float32(power)) * near
+    if excitation > 0.0:
+        responses = _excited(responses, window, centres_m, excitation, excitation_m)
+    slot = np.argmax(responses)
+    recruits = nearest >= threshold_m**2 and learns != 0
+    if recruits:
+        new = n_cells[0]
+        if new >= weights.shape[1]:
+            return 4
+        for i in range(n_grid):
+            weights[0, new, i] = grid[i]
+        centres_m[0, new, 0], centres_m[0, new, 1] = x, y
+        n_cells[0] = new + 1
+        # The new cell replaces the farthest in the window, unless it is there already.
+        slot = far
+        for k in range(window.shape[1] - 1, -1, -1):
+            if window[0, k] == new:
+                slot = k
+        window[0, slot] = new
+    cell = window[0, slot]
+    if rate > 0.0 and learns != 0:
+        squares = zero
+        for i in range(n_grid):
+            moved = weights[0, cell, i] + np.float32(rate) * (grid[i] - weights[0, cell, i])
+            weights[0, cell, i] = moved
+            squares += moved * moved
+        norm = max(np.float32(math.sqrt(squares)), np.float32(1e-12))
+        for i in range(n_grid):
+            weights[0, cell, i] /= norm
+    if learns >= 0 and n_cells[0] == 0:  # an animal lost from the start has no cell
+        cell = _NO_CELL
+    before = winner[0]
+    if cell == before:
+        return int(recruits)
+    if learns < 0 and before >= 0:
+        time_s[0, before] += stay_s
+    if learns != 0:
+        visits[0, cell] += 1
+        if before >= 0:
+            _link(before, cell, neighbours)
+            _link(cell, before, neighbours)
+    winner[0] = cell
+    return int(recruits) + 2
 
 
 class Stay(Scalars):
@@ -87,7 +297,8 @@ class Stay(Scalars):
 class CompetitiveHebbianPlaceCells(BufferModule):
     """Place cells that compete for patterns of grid cells; a new one is recruited far from others.
 
-    :func:`place_response` and :func:`hebbian_step` have the mathematics. The winner is found among
+    :func:`place_response`, :func:`excited`, :func:`bump_of` and :func:`hebbian_step` have the
+    mathematics. The winner is found among
     the nearest cells: beyond them the response is bounded by the distance alone. State: for every
     cell its ``weights``, ``centres_m``, ``visits``, ``time_s`` and ``neighbours`` (the graph:
     cells that won one after the other), and the window of nearest cells.
@@ -172,7 +383,7 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         competes, leaves_window = moved.any(1).tolist()
         if learns is not None:
             self._flush_time()
-            self._credit(self.winner, learns * dt_s)
+            self._credit(self.winner, learns.to(self.time_s) * dt_s)
         if not competes:
             self.now.stay_s += dt_s if learns is None else 0.0
             none = torch.zeros_like(self.winner, dtype=torch.bool)
@@ -183,6 +394,8 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         c = self.config
         away = (centres - position.unsqueeze(1)).square().sum(-1)
         response = place_response(weights, away.to(grid), grid, c.power, c.continuity_m)
+        if c.excitation:
+            response = excited(response, centres, c.excitation, c.excitation_m)
         slot = response.argmax(-1)
         recruited = away.amin(-1) >= c.threshold_m**2
         if learns is not None:
@@ -201,6 +414,38 @@ class CompetitiveHebbianPlaceCells(BufferModule):
             self.winner = winner
         self.now.stay_s += dt_s if learns is None else 0.0
         return self._response(recruited, changed)
+
+    def compete_compiled(
+        self, rates: np.ndarray, position_m: np.ndarray, dt_s: float, learns: bool | None
+    ) -> tuple[int, bool]:
+        """Do as :meth:`forward` for one animal, in place.
+
+        Args:
+            rates: Rates of the grid cells, ``(n_modules, n_cells)``.
+            position_m: Position of the animal, ``(2,)``.
+            dt_s: Time since the last step.
+            learns: Whether the animal recruits and learns; ``None``: it does.
+
+        Returns:
+            Number of the winner, -1 while there is none; whether it was recruited in this step.
+        """
+        if self._near is not None:
+            self._write_back()
+            self._near = None
+        c, now, grows, told = self.config, self.now, False, -1 if learns is None else int(learns)
+        while True:
+            *arrays, _ = cast(Arrays, self.arrays())
+            done = compete_step(
+                grows, rates, position_m, dt_s, now.stay_s, told, c.power, c.continuity_m,
+                c.threshold_m, c.hebbian_rate, c.excitation, c.excitation_m, *arrays,
+            )  # fmt: skip
+            grows = done >= 4
+            if not grows:
+                break
+            self._grow()
+        stay_s = 0.0 if done >= 2 or told >= 0 else now.stay_s
+        now.stay_s = stay_s + dt_s if told < 0 else stay_s
+        return int(arrays[6][0]), done % 2 == 1
 
     def _response(self, recruited: Tensor, changed: Tensor) -> PlaceResponse:
         if self.batch is not None:
@@ -227,6 +472,23 @@ class CompetitiveHebbianPlaceCells(BufferModule):
             away = (self.centres_m[:, :n] - position.unsqueeze(1)).square().sum(-1).to(away)
         response = place_response(weights, away, grid, c.power, c.continuity_m)
         return response[0] if one else response
+
+    @without_gradients
+    def bump(self, grid: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the bump of all cells ``([batch,] n)``, and the position that it encodes.
+
+        Args:
+            grid: Rates of the grid cells, ``([batch,] n_grid)``.
+            position_m: Where the animal believes to be, ``([batch,] 2)``.
+
+        Returns:
+            The bump, of :func:`bump_of`, and its centre of mass, ``([batch,] 2)``, metres.
+        """
+        c, response = self.config, self.responses(grid, position_m)
+        centres = self.centres_m[:, : response.shape[-1]]
+        centres = centres[0] if self.batch is None else centres
+        bump = bump_of(excited(response, centres, c.excitation, c.excitation_m), c.inhibition)
+        return bump, (bump.to(centres).unsqueeze(-1) * centres).sum(-2)
 
     def centre_of(self, cells: Tensor) -> Tensor:
         """Return the centre of one cell of each animal, ``([batch,] 2)``."""

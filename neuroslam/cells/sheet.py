@@ -3,12 +3,16 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from neuroslam.cells.convolve import fourier_convolve
 from neuroslam.cells.interference import checked_velocity
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.errors import ConfigError
 from neuroslam.geometry import TWO_PI
 
@@ -21,6 +25,8 @@ _WAVES = ((math.sqrt(0.75), 0.5), (math.sqrt(0.75), -0.5), (0.0, 1.0))
 _PAPER_CELLS = 13.0
 """The model's lambda_net in cells, for which its weights are given."""
 _SETTLING_TAUS = 100.0
+_SILENT = 1e-20
+"""Rate below which a cell is silent: numbers that fade on below 1e-38 take much longer."""
 _CALIBRATING_DRIVES = (0.02, 0.05, 0.1)
 
 
@@ -137,7 +143,113 @@ def _feedforward(drive: Tensor) -> Tensor:
 
 def _relax(rates: Tensor, feedforward: Tensor, weights: Tensor, fraction: float) -> Tensor:
     field = fourier_convolve(rates, weights).unsqueeze(-3)
-    return torch.lerp(rates, (field + feedforward).clamp_min_(0.0), fraction)
+    relaxed = torch.lerp(rates, (field + feedforward).clamp_min_(0.0), fraction)
+    return F.threshold(relaxed, _SILENT, 0.0)
+
+
+class _Waves(NamedTuple):
+    """The waves that the weights let through; real parts stand before imaginary ones.
+
+    Attributes:
+        into_x: From cells along x to waves, ``(n_x, 2 k_x)``.
+        shift_x: Factor of the layer that prefers +x, ``(2, k_x)``.
+        into_y: From three rows of cells along y, the second and third for the layers that prefer
+            +y and -y, ``(2 k_y, 6 n_y)``.
+        gain: ``(k_y, k_x)``.
+        from_y: To cells along y, ``(2 n_y, 2 k_y)``.
+        from_x: To cells along x, ``(2 k_x, n_x)``.
+    """
+
+    into_x: np.ndarray
+    shift_x: np.ndarray
+    into_y: np.ndarray
+    gain: np.ndarray
+    from_y: np.ndarray
+    from_x: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def _waves(parameters: SheetParameters) -> _Waves:
+    """Return the waves of :func:`sheet_weights` that are not 1e-10 times weaker than the first."""
+    p = parameters
+    weights = sheet_weights(p).numpy()
+    own = weights[0] * np.exp(1j * TWO_PI / _SIZE[0] * p.shift * np.arange(p.n_x // 2 + 1))
+    heard = np.abs(own) > 1e-10 * np.abs(own).max()
+    rows, columns = np.flatnonzero(heard.any(1)), np.flatnonzero(heard.any(0))
+    k_y, k_x = np.fft.fftfreq(p.n_y, 1.0 / p.n_y)[rows], columns.astype(np.float64)
+    turn_x = np.exp(-1j * TWO_PI / p.n_x * np.outer(np.arange(p.n_x), k_x))
+    turn_y = np.exp(-1j * TWO_PI / p.n_y * np.outer(k_y, np.arange(p.n_y)))
+    shift_x = np.exp(-1j * TWO_PI / _SIZE[0] * p.shift * k_x)
+    shift_y = np.exp(-1j * TWO_PI / _SIZE[1] * p.shift * k_y)[:, None]
+    into_y = np.concatenate([turn_y, turn_y * shift_y, turn_y * shift_y.conj()], axis=1)
+    once = (columns == 0) | (2 * columns == p.n_x)
+    back = (np.where(once, 1.0, 2.0) / p.n_x)[:, None] * turn_x.T
+    made = (
+        np.concatenate([np.real(turn_x), np.imag(turn_x)], axis=1),
+        np.stack([np.real(shift_x), np.imag(shift_x)]),
+        _as_real(into_y),
+        np.real(own)[np.ix_(rows, columns)],
+        _as_real(turn_y.conj().T / p.n_y),
+        np.concatenate([np.real(back), np.imag(back)]),
+    )
+    return _Waves(*(np.ascontiguousarray(part, np.float32) for part in made))
+
+
+def _as_real(matrix: np.ndarray) -> np.ndarray:
+    """Return a complex matrix as one of real numbers, for vectors whose real parts come first."""
+    real, imaginary = np.real(matrix), np.imag(matrix)
+    return np.block([[real, -imaginary], [imaginary, real]])
+
+
+@compiled
+def relax_step(
+    rates: np.ndarray, feedforward: np.ndarray, fraction: float, n_steps: int,
+    into_x: np.ndarray, shift_x: np.ndarray, into_y: np.ndarray, gain: np.ndarray,
+    from_y: np.ndarray, from_x: np.ndarray,
+) -> None:  # fmt: skip
+    """Take Euler steps of one animal as :func:`sheet_step` does, in place.
+
+    The weights let few waves through; a sum over those is all of the convolution. The arrays after
+    the number of steps are those of ``_Waves``.
+    """
+    n_y, n_x, k_y, k_x = rates.shape[1], rates.shape[2], gain.shape[0], gain.shape[1]
+    share, zero, least = np.float32(fraction), np.float32(0.0), np.float32(_SILENT)
+    cells = rates.reshape(4 * n_y, n_x)
+    waves = np.empty((4 * n_y, 2 * k_x), np.float32)
+    rows, heard = np.empty((6 * n_y, k_x), np.float32), np.empty((2 * k_y, k_x), np.float32)
+    back, turned = np.empty((2 * n_y, k_x), np.float32), np.empty((n_y, 2 * k_x), np.float32)
+    field = np.empty((n_y, n_x), np.float32)
+    for _ in range(n_steps):
+        np.dot(cells, into_x, waves)
+        for y in range(n_y):
+            ahead, behind = waves[y], waves[n_y + y]
+            for k in range(k_x):
+                c, s, i = shift_x[0, k], shift_x[1, k], k_x + k
+                rows[y, k] = c * (ahead[k] + behind[k]) - s * (ahead[i] - behind[i])
+                rows[3 * n_y + y, k] = c * (ahead[i] + behind[i]) + s * (ahead[k] - behind[k])
+                rows[n_y + y, k], rows[4 * n_y + y, k] = (
+                    waves[2 * n_y + y, k],
+                    waves[2 * n_y + y, i],
+                )
+                rows[2 * n_y + y, k] = waves[3 * n_y + y, k]
+                rows[5 * n_y + y, k] = waves[3 * n_y + y, i]
+        np.dot(into_y, rows, heard)
+        for m in range(k_y):
+            for k in range(k_x):
+                heard[m, k] *= gain[m, k]
+                heard[k_y + m, k] *= gain[m, k]
+        np.dot(from_y, heard, back)
+        for y in range(n_y):
+            for k in range(k_x):
+                turned[y, k], turned[y, k_x + k] = back[y, k], back[n_y + y, k]
+        np.dot(turned, from_x, field)
+        for layer in range(4):
+            push = feedforward[layer]
+            for y in range(n_y):
+                for x in range(n_x):
+                    before = rates[layer, y, x]
+                    after = before + share * (max(field[y, x] + push, zero) - before)
+                    rates[layer, y, x] = after if after > least else zero
 
 
 def pattern_waves(rates: Tensor) -> Tensor:
@@ -342,6 +454,12 @@ class GridSheet(nn.Module):
         drive = drive * (p.drive_limit / speed.clamp_min(p.drive_limit))
         feedforward, weights = _feedforward(drive), torch.view_as_complex(self.weights)
         n_substeps = math.ceil(dt_s / (p.substep * p.tau_s) - 1e-9)
+        if runs_compiled(self.sheet, drive) and self.sheet.dtype == torch.float32 and n_substeps:
+            self.sheet = rates = self.sheet.clone(memory_format=torch.contiguous_format)
+            pushed = feedforward.reshape(-1, 4).numpy()
+            for animal, push in zip(rates.view(-1, *rates.shape[-3:]).numpy(), pushed, strict=True):
+                relax_step(animal, push, dt_s / (n_substeps * p.tau_s), n_substeps, *_waves(p))
+            return self.rates
         rates = self.sheet
         for _ in range(n_substeps):
             rates = _relax(rates, feedforward, weights, dt_s / (n_substeps * p.tau_s))

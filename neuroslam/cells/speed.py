@@ -14,8 +14,9 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BrainConfig, Section
-from neuroslam.state.mergeable import about_now, without_gradients
+from neuroslam.state.mergeable import Arrays, about_now, without_gradients
 from neuroslam.state.population import Population, StepInput
 from neuroslam.state.registry import register
 from neuroslam.types import Motion
@@ -147,6 +148,22 @@ def speed_rates(
     return tuning.rest_hz + tuning.slope_hz_s_m * ahead.clamp(0.0, max_speed_m_s)
 
 
+@compiled
+def rates_step(
+    speed_m_s: float, dt_s: float, smooth_s: float, max_speed_m_s: float, rest_hz: np.ndarray,
+    slope_hz_s_m: np.ndarray, lead_s: np.ndarray, smoothed_m_s: np.ndarray, rates_hz: np.ndarray,
+) -> None:  # fmt: skip
+    """Do as :func:`acceleration` and :func:`speed_rates` for one animal, in place."""
+    change, kept = 0.0, 0.0
+    if dt_s > 0.0:
+        kept = math.exp(-dt_s / smooth_s)
+        change = (speed_m_s - smoothed_m_s[()]) * ((1.0 - kept) / dt_s)
+    smoothed_m_s[()] = speed_m_s - kept * (speed_m_s - smoothed_m_s[()])
+    for c in range(rates_hz.shape[0]):
+        ahead = min(max(speed_m_s + lead_s[c] * change, 0.0), max_speed_m_s)
+        rates_hz[c] = rest_hz[c] + slope_hz_s_m[c] * ahead
+
+
 def fit_readout(tuning: SpeedTuning, max_speed_m_s: float) -> Tensor:
     r"""Fit the weights that decode speed from rates, by least squares.
 
@@ -258,6 +275,13 @@ class SpeedCells(Population):
             motion: Speed in m/s (in a batch ``(batch,)``) for how many seconds.
         """
         c = self.config
+        if self.batch is None and c.noise_hz == 0.0 and runs_compiled(self.rates_hz):
+            rest, slope, lead, smoothed, rates, _ = cast(Arrays, self.arrays())
+            rates_step(
+                abs(float(motion.v_m_s)), motion.dt_s, c.smooth_s, c.max_speed_m_s, rest, slope,
+                lead, smoothed, rates,
+            )  # fmt: skip
+            return
         speed = torch.as_tensor(motion.v_m_s, dtype=torch.float64, device=self.rates_hz.device)
         speed = speed.abs().expand_as(self.smoothed_m_s)
         if motion.dt_s > 0.0:
@@ -296,7 +320,7 @@ class SpeedCells(Population):
     @property
     def rates(self) -> np.ndarray:
         """Rate of every cell in Hz, ``([batch,] n)``."""
-        return self.rates_hz.numpy(force=True)
+        return self.rates_hz.numpy(force=True).copy()
 
     def counts(self) -> dict[str, float]:
         """Return the number of cells."""

@@ -15,7 +15,8 @@ OWN = 4
 ACTIVE = 96
 """Largest number of walls, the nearest ones, with a row in the covariance; others are stored."""
 
-_UNKNOWN_M2 = 1.0  # variance of a distance before it was measured
+UNKNOWN_M2 = 1.0
+"""Variance of a distance before it was measured."""
 
 
 class Since(Scalars):
@@ -95,22 +96,31 @@ class WallTable(BufferModule):
                     continue
                 wall = n
                 new = [*position[row], bearing[row], distance[row]]
-                rest = position.new_tensor([_UNKNOWN_M2, self.since.time_s])
+                rest = position.new_tensor([UNKNOWN_M2, self.since.time_s])
                 self._remember(row, torch.cat([torch.stack(new), rest]))
             slot[row], known[row] = self._activate(row, wall, position[row]), True
         return slot, known
 
     def _remember(self, row: int, wall: Tensor) -> None:
         n = int(self.n_walls[row])
-        walls = self.walls
-        if n == walls.shape[1]:
-            walls = torch.cat([walls, walls.new_zeros(len(walls), max(16, n), walls.shape[2])], 1)
-        else:
-            walls = walls.clone()
+        if n == self.walls.shape[1]:
+            self._add_rows()
+        walls = self.walls.clone()
         walls[row, n] = wall
         self.walls = walls
         self.n_walls = self.n_walls.clone()
         self.n_walls[row] += 1
+
+    def _add_rows(self) -> None:
+        walls = self.walls
+        more = walls.new_zeros(len(walls), max(16, walls.shape[1]), walls.shape[2])
+        self.walls = torch.cat([walls, more], 1)
+
+    def _add_slots(self) -> None:
+        width = self.active.shape[1]
+        more = min(max(16, width), ACTIVE - width)
+        self.active = torch.nn.functional.pad(self.active, (0, more), value=-1)
+        self.covariance = torch.nn.functional.pad(self.covariance, (0, more, 0, more))
 
     def _activate(self, row: int, wall: int, position: Tensor) -> int:
         """Give a wall a row in the covariance; if there is none left, that of the farthest wall."""
@@ -120,9 +130,7 @@ class WallTable(BufferModule):
             slot = int(free[0])
         elif width < ACTIVE:
             slot = width
-            more = min(max(16, width), ACTIVE - width)
-            self.active = torch.nn.functional.pad(self.active, (0, more), value=-1)
-            self.covariance = torch.nn.functional.pad(self.covariance, (0, more, 0, more))
+            self._add_slots()
         else:
             anchors = self.walls[row, self.active[row], :2]
             slot = int((anchors - position).square().sum(-1).argmax())

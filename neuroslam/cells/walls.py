@@ -8,14 +8,19 @@ weighs more than one sensed late, and the constant errors of speed and compass a
 """
 
 import math
+from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.cells import wall_table
 from neuroslam.cells.boundary_vectors import Wall, wall_innovation, wrap
 from neuroslam.cells.wall_table import OWN, WallTable
+from neuroslam.compiled import compiled
 from neuroslam.config import WallMemoryConfig
-from neuroslam.state.mergeable import without_gradients
+from neuroslam.geometry import TWO_PI
+from neuroslam.state.mergeable import Arrays, without_gradients
 
 SAMPLE_S = 0.05
 """Correlation time of random errors of speed and heading, whatever the frame rate."""
@@ -23,6 +28,250 @@ SAMPLE_S = 0.05
 _OLD_S = 60.0  # only memories older than this tell whether the animal is lost
 _ABREAST = 0.2  # share of a segment within which the wall must still be sensed
 _ALIKE_RAD = math.radians(25.0)
+
+# Numbers of the config that the compiled steps take.
+_SHARE, _ADDED, _SLOW_S, _SLOW_RAD2, _SIGMA2, _SIGMA_RAD, _GATE2, _WIDTH2, _FOUR_SPREADS = range(9)
+_UNKNOWN_M2 = wall_table.UNKNOWN_M2
+_DONE, _NEEDS_ROW, _NEEDS_SLOT = -1, 0, 1  # of :func:`correct_step`
+
+
+@compiled
+def _wrapped(angle_rad: float) -> float:
+    """Do as :func:`~neuroslam.cells.boundary_vectors.wrap`."""
+    return (angle_rad + math.pi) % TWO_PI - math.pi
+
+
+@compiled
+def move_step(
+    speed_m_s: float, heading_rad: float, dt_s: float,
+    errors: np.ndarray, moved_m: np.ndarray, squares_m2: np.ndarray,
+) -> tuple[float, float]:  # fmt: skip
+    """Do as :meth:`WallMemory.move` for one animal, in place; return the displacement."""
+    length = speed_m_s * (dt_s - dt_s * errors[0, 0])
+    heading = heading_rad - errors[0, 1]
+    dx, dy = length * math.cos(heading), length * math.sin(heading)
+    moved_m[0, 0] += dx
+    moved_m[0, 1] += dy
+    if dt_s > 0.0:
+        squares_m2[0] += length * length * (SAMPLE_S / dt_s)
+    return dx, dy
+
+
+@compiled
+def predict_step(
+    since_s: float, compass: bool, numbers: np.ndarray,
+    covariance: np.ndarray, errors: np.ndarray, moved_m: np.ndarray, squares_m2: np.ndarray,
+) -> None:  # fmt: skip
+    """Do as ``WallMemory._predict`` for one animal, in place; all but the time."""
+    p, n = covariance[0], covariance.shape[1]
+    dx, dy = moved_m[0, 0], moved_m[0, 1]
+    a, b = dx / (errors[0, 0] - 1.0), dy / (errors[0, 0] - 1.0)
+    spread = numbers[_SHARE] * squares_m2[0] + numbers[_ADDED] * since_s
+    for j in range(n):
+        p[0, j] += a * p[2, j] + dy * p[3, j]
+        p[1, j] += b * p[2, j] - dx * p[3, j]
+    for i in range(n):
+        p[i, 0] += p[i, 2] * a + p[i, 3] * dy
+        p[i, 1] += p[i, 2] * b - p[i, 3] * dx
+    p[0, 0] += spread
+    p[1, 1] += spread
+    stays = math.exp(-since_s / numbers[_SLOW_S])
+    if compass:
+        for j in range(n):
+            p[3, j] *= stays
+        for i in range(n):
+            p[i, 3] *= stays
+        errors[0, 1] *= stays
+    p[3, 3] += numbers[_SLOW_RAD2] * (1.0 - stays * stays)
+    moved_m[0, 0] = moved_m[0, 1] = squares_m2[0] = 0.0
+
+
+@compiled
+def _apply_step(
+    change: np.ndarray, errors: np.ndarray, walls: np.ndarray, active: np.ndarray
+) -> None:
+    """Do as ``WallMemory._apply_change`` for one animal, in place."""
+    errors[0, 0] += change[2]
+    errors[0, 1] += change[3]
+    for slot in range(active.shape[1]):
+        if active[0, slot] >= 0:
+            walls[0, active[0, slot], 3] += change[OWN + slot]
+
+
+@compiled
+def _mismatch(
+    walls: np.ndarray, k: int, x_m: float, y_m: float, bearing_rad: float, scale: np.ndarray
+) -> float:
+    """Do as :func:`~neuroslam.cells.boundary_vectors.squared_mismatch` for one wall."""
+    dx, dy = walls[0, k, 0] - x_m, walls[0, k, 1] - y_m
+    turn = _wrapped(walls[0, k, 2] - bearing_rad) / scale[1]
+    return (dx * dx + dy * dy) / (scale[0] * scale[0]) + turn * turn
+
+
+@compiled
+def _recalled(
+    x_m: float, y_m: float, distance_m: float, bearing_rad: float,
+    learns: bool, time_s: float, most: int, walls: np.ndarray, n_walls: np.ndarray,
+    active: np.ndarray, covariance: np.ndarray, scale: np.ndarray,
+) -> tuple[int, int]:  # fmt: skip
+    """Do as ``WallTable._recall``; return the slot, and which table must grow first."""
+    n, wall, least = n_walls[0], -1, np.inf
+    for k in range(n):
+        cost, is_active = _mismatch(walls, k, x_m, y_m, bearing_rad, scale), False
+        for slot in range(active.shape[1]):
+            is_active |= active[0, slot] == k
+        if not is_active and cost < least:
+            wall, least = k, cost
+    new = least >= 1.0
+    if new and not learns:
+        return -1, _DONE
+    if new and n == walls.shape[1]:
+        return -1, _NEEDS_ROW
+    free, width = -1, active.shape[1]
+    for slot in range(width):
+        if active[0, slot] < 0:
+            free = slot
+            break
+    if free < 0 and width < most:
+        return -1, _NEEDS_SLOT
+    if new:
+        wall = n
+        walls[0, wall, 0], walls[0, wall, 1] = x_m, y_m
+        walls[0, wall, 2], walls[0, wall, 3] = bearing_rad, distance_m
+        walls[0, wall, 4], walls[0, wall, 5] = _UNKNOWN_M2, time_s
+        n_walls[0] = n + 1
+    if free < 0:
+        farthest = -1.0
+        for slot in range(width):
+            dx, dy = walls[0, active[0, slot], 0] - x_m, walls[0, active[0, slot], 1] - y_m
+            if dx * dx + dy * dy > farthest:
+                free, farthest = slot, dx * dx + dy * dy
+        for slot in range(width):
+            walls[0, active[0, slot], 4] = covariance[0, OWN + slot, OWN + slot]
+    for j in range(covariance.shape[1]):
+        covariance[0, OWN + free, j] = covariance[0, j, OWN + free] = 0.0
+    covariance[0, OWN + free, OWN + free] = walls[0, wall, 4]
+    active[0, free] = wall
+    return free, _DONE
+
+
+@compiled
+def correct_step(
+    first: int, position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray,
+    compass: bool, learns: bool, time_s: float, most: int, numbers: np.ndarray,
+    walls: np.ndarray, n_walls: np.ndarray, active: np.ndarray, covariance: np.ndarray,
+    errors: np.ndarray, scale: np.ndarray, rejected: np.ndarray, accepted: np.ndarray,
+) -> tuple[int, int]:  # fmt: skip
+    """Do as ``WallMemory._correct_by_wall`` for the walls of one animal, in place.
+
+    ``first`` is the number of the first wall of those at ``distance_m`` and ``bearing_rad`` in the
+    world; ``position_m``, ``(2,)``, is corrected; ``most`` is the largest number of active walls.
+
+    Returns:
+        Number of the wall at which a table must grow, and which one; the step continues there.
+    """
+    p, n = covariance[0], covariance.shape[1]
+    change, moves = np.empty(n), np.empty(n)
+    for w in range(first, distance_m.shape[0]):
+        distance = distance_m[w]
+        if not np.isfinite(distance):
+            break
+        x, y = position_m[0], position_m[1]
+        bearing = bearing_rad[w] - errors[0, 1]
+        slot, least = 0, np.inf
+        for k in range(active.shape[1]):
+            if active[0, k] >= 0:
+                cost = _mismatch(walls, active[0, k], x, y, bearing, scale)
+                if cost < least:
+                    slot, least = k, cost
+        if least >= 1.0:
+            slot, needs = _recalled(
+                x, y, distance, bearing, learns, time_s, most, walls, n_walls, active, covariance,
+                scale,
+            )  # fmt: skip
+            if needs != _DONE:
+                return w, needs
+            if slot < 0:
+                continue
+        elif not compass:
+            wall = active[0, slot]
+            half = _wrapped(bearing - walls[0, wall, 2]) / 2
+            middle = walls[0, wall, 2] + half
+            nx, ny = math.cos(middle) / math.cos(half), math.sin(middle) / math.cos(half)
+            lever = (walls[0, wall, 1] - y) * nx - (walls[0, wall, 0] - x) * ny
+            share = lever / numbers[_FOUR_SPREADS]
+            variance = p[3, 3] + numbers[_WIDTH2] + share * share
+            turn = _wrapped(bearing - walls[0, wall, 2])
+            for j in range(n):
+                moves[j] = p[3, j]
+                change[j] = p[3, j] / variance
+            for i in range(n):
+                for j in range(n):
+                    p[i, j] -= change[i] * moves[j]
+            for j in range(n):
+                change[j] *= turn
+            _apply_step(change, errors, walls, active)
+            position_m[0] += change[0]
+            position_m[1] += change[1]
+            x, y, bearing = position_m[0], position_m[1], bearing - change[3]
+        wall, row = active[0, slot], OWN + slot
+        half = _wrapped(bearing - walls[0, wall, 2]) / 2
+        middle = walls[0, wall, 2] + half
+        nx, ny = math.cos(middle) / math.cos(half), math.sin(middle) / math.cos(half)
+        dx, dy = walls[0, wall, 0] - x, walls[0, wall, 1] - y
+        off = distance - walls[0, wall, 3] - dx * nx - dy * ny
+        half = 0.5 * (dy * nx - dx * ny)
+        for j in range(n):
+            moves[j] = p[row, j] - nx * p[0, j] - ny * p[1, j] - half * p[3, j]
+        white = half * numbers[_SIGMA_RAD]
+        variance = (
+            moves[row] - nx * moves[0] - ny * moves[1] - half * moves[3]
+            + numbers[_SIGMA2] + white * white
+        )  # fmt: skip
+        if not off * off < numbers[_GATE2] * variance:
+            rejected[0] = True
+            continue
+        if time_s - walls[0, wall, 5] > _OLD_S:
+            accepted[0] = True
+        for j in range(n):
+            change[j] = moves[j] / variance
+        for i in range(n):
+            for j in range(n):
+                p[i, j] -= change[i] * moves[j]
+        for j in range(n):
+            change[j] *= off
+        _apply_step(change, errors, walls, active)
+        position_m[0] += change[0]
+        position_m[1] += change[1]
+    return -1, _DONE
+
+
+@compiled
+def evidence_step(
+    position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray, sure_m: float,
+    time_s: float, walls: np.ndarray, active: np.ndarray, scale: np.ndarray,
+    rejected: np.ndarray, accepted: np.ndarray, errors: np.ndarray,
+) -> tuple[bool, bool]:  # fmt: skip
+    """Do as :meth:`WallMemory.evidence` for one animal; bearings have the compass error yet."""
+    against = rejected[0]
+    for slot in range(active.shape[1]):
+        k = active[0, slot]
+        if k < 0 or not time_s - walls[0, k, 5] > _OLD_S:
+            continue
+        dx, dy = walls[0, k, 0] - position_m[0], walls[0, k, 1] - position_m[1]
+        nx, ny = math.cos(walls[0, k, 2]), math.sin(walls[0, k, 2])
+        expected = walls[0, k, 3] + dx * nx + dy * ny
+        if not abs(dy * nx - dx * ny) < _ABREAST * scale[0] or not 0.0 < expected < sure_m:
+            continue
+        met = False
+        for w in range(distance_m.shape[0]):
+            turn = _wrapped(bearing_rad[w] - errors[0, 1] - walls[0, k, 2])
+            met |= abs(turn) < _ALIKE_RAD and abs(distance_m[w] - expected) < 0.5 * sure_m
+        if not met:
+            against = True
+    supports = accepted[0] and not against
+    rejected[0] = accepted[0] = False
+    return against, supports
 
 
 class WallMemory(WallTable):
@@ -65,6 +314,13 @@ class WallMemory(WallTable):
         self.register_buffer("accepted", torch.zeros(b, dtype=torch.bool))
         variances = [0.0, 0.0, config.speed_scale**2, math.radians(config.heading_slow_deg) ** 2]
         self.covariance[:] = torch.diag(torch.tensor(variances, dtype=kind))
+        c, sigma_rad = config, math.radians(config.sigma_deg)
+        share = 0.5 * (c.speed_factor**2 + math.radians(c.heading_white_deg) ** 2)
+        added, slow_rad = 0.5 * c.speed_add_m_s**2 * SAMPLE_S, math.radians(c.heading_slow_deg)
+        self._numbers = np.array([
+            share, added, c.heading_slow_s, slow_rad**2, c.sigma_m**2, sigma_rad, c.gate**2,
+            (2.0 * sigma_rad) ** 2, 4.0 * c.spread_m,
+        ])  # fmt: skip
 
     @property
     def position_variance_m2(self) -> Tensor:
@@ -220,6 +476,62 @@ class WallMemory(WallTable):
         fresh[:, 0, 0] = fresh[:, 1, 1] = sigma_m**2
         self.covariance = fresh
         self.reset_motion()
+
+    def move_compiled(
+        self, speed_m_s: float, heading_rad: float, dt_s: float
+    ) -> tuple[float, float]:
+        """Do as :meth:`move` for one animal, in place; return the displacement."""
+        arrays = cast(Arrays, self.arrays())
+        since = self.since.__dict__
+        since["s"] += dt_s
+        since["time_s"] += dt_s
+        return move_step(speed_m_s, heading_rad, dt_s, *arrays[4:7])
+
+    def update_compiled(
+        self, position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray,
+        *, compass: bool, learns: bool,
+    ) -> None:  # fmt: skip
+        """Do as :meth:`update_from_walls` for one animal that is due; correct the position.
+
+        Args:
+            position_m: Estimated position, ``(2,)``; corrected in place.
+            distance_m: Distances, ``(n,)``, the first finite.
+            bearing_rad: Bearings in the world, ``(n,)``.
+            compass: Whether the heading is measured.
+            learns: Whether new walls are remembered.
+        """
+        walls, n_walls, active, covariance, errors, moved, squares, scale, rejected, accepted = (
+            cast(Arrays, self.arrays())
+        )
+        predict_step(self.since.s, compass, self._numbers, covariance, errors, moved, squares)
+        self.since.s = 0.0
+        first, needs = 0, _DONE
+        while first >= 0:
+            if needs == _NEEDS_ROW:
+                self._add_rows()
+            elif needs == _NEEDS_SLOT:
+                self._add_slots()
+            walls, n_walls, active, covariance, *_ = cast(Arrays, self.arrays())
+            first, needs = correct_step(
+                first, position_m, distance_m, bearing_rad, compass, learns, self.since.time_s,
+                wall_table.ACTIVE, self._numbers, walls, n_walls, active, covariance, errors, scale,
+                rejected, accepted,
+            )  # fmt: skip
+
+    def evidence_compiled(
+        self, position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray, sure_m: float
+    ) -> tuple[bool, bool, float]:
+        """Do as :meth:`evidence` for one animal, by bearings not less the compass error.
+
+        Returns:
+            Against and for, and the compass error.
+        """
+        walls, _, active, _, errors, _, _, scale, rejected, accepted = cast(Arrays, self.arrays())
+        against, supports = evidence_step(
+            position_m, distance_m, bearing_rad, sure_m, self.since.time_s, walls, active, scale,
+            rejected, accepted, errors,
+        )  # fmt: skip
+        return against, supports, errors[0, 1]
 
     def reset_motion(self) -> None:
         """Reset the motion since the last correction."""

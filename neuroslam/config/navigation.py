@@ -123,6 +123,31 @@ class GridCellConfig(Section):
         description="learning rate of the inhibition between cells; larger: cells become different "
         "sooner",
     )
+    lateral: Literal["learned", "kernel", "both"] = Field(
+        default="learned",
+        description="coupling of the cells of a module: learned inhibition; a kernel over the "
+        "sheet on which they lie, that excites neighbours; or both added up",
+    )
+    excitation: float = Field(
+        default=2.0,
+        ge=0,
+        description="strength of the kernel's excitation; larger: neighbours fire more alike",
+    )
+    excitation_cells: float = Field(
+        default=1.0,
+        gt=0,
+        description="width of the kernel's excitation in cells; larger: reaches farther",
+    )
+    inhibition: float = Field(
+        default=2.0,
+        ge=0,
+        description="strength of the kernel's inhibition; larger: cells far apart fire less alike",
+    )
+    inhibition_cells: float = Field(
+        default=2.0,
+        gt=0,
+        description="width of the kernel's inhibition in cells; larger: reaches farther",
+    )
     threshold_rate: float = Field(
         default=0.02,
         ge=0,
@@ -231,6 +256,26 @@ class PlaceCellConfig(Section):
         le=1,
         description="share by which the winner's weights move to the grid pattern in a step; "
         "larger: faster, forgets sooner; 0: no learning",
+    )
+    excitation: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="how strongly a place cell excites its neighbours before cells compete; "
+        "larger: a wider bump; 0: the cell with the largest response wins",
+    )
+    excitation_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="width of the Gaussian over the distance of place cells by which they excite "
+        "each other; larger: reaches farther cells",
+    )
+    inhibition: float = Field(
+        default=0.3,
+        ge=0,
+        lt=1,
+        description="share of the largest activity that global inhibition takes from all place "
+        "cells; larger: fewer cells in the bump",
     )
 
 

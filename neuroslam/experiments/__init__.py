@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
     "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
+    "place-bump": ("neuroslam.experiments.place_bump", "place_bump", "rodent"),
     "semantic-maps": ("neuroslam.experiments.semantic_maps", "semantic_maps", None),
     "ssp-map": ("neuroslam.experiments.ssp_map", "ssp_map", None),
     "ssp-activity": ("neuroslam.experiments.ssp_activity", "ssp_activity", "rodent"),

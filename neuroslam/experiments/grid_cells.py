@@ -6,6 +6,7 @@ unvisited bins of a map, see :func:`neuroslam.evaluation.gridness.gridness`.
 
 import math
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -173,15 +174,16 @@ def recorded_cell(data: Path) -> tuple[Firing, dict[str, Any]]:
 
 
 def count_directions(data: Path, minutes: float, grid: GridCellConfig) -> list[dict[str, Any]]:
-    """Score grid cells trained with 6, 12 and 36 directions, in the pentagon, one seed."""
+    """Score grid cells of 6, 12 and 36 directions by their coupling, in the pentagon, one seed."""
     walk, rows = read_track(data, "pentagon", minutes), []
-    for directions in (6, 12, 36):
-        config = BrainConfig(grid_cells=grid.model_copy(update={"directions": directions}))
+    for directions, lateral in product((6, 12, 36), ("learned", "kernel", "both")):
+        other = {"directions": directions, "lateral": lateral}
+        config = BrainConfig(grid_cells=grid.model_copy(update=other))
         (census,), _ = simulate_grid(walk, [0], [walk.duration_s], config)
         silent, skip = by_seed(census.silent[0]), by_seed(census.skip[0])
         rows.append(
             {
-                "directions": directions,
+                **other,
                 "gridness_silent": median(census.silent),
                 "gridness_skip": median(census.skip),
                 "lowest_module": float(np.nanmin(silent)),

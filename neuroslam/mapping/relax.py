@@ -1,7 +1,8 @@
 r"""RatSLAM's relaxation of the map, link by link.
 
 One loop visits the links in the order of their source, then of their number, and each visit moves
-both ends by a share of the link's error, in opposite directions [MW08, Eq. 8]:
+both ends by a share of the link's error, in opposite directions (multisession RatSLAM, Eq. 8, which
+moves all at once and has the wrong sign for links that end at an experience):
 
 .. math:: \theta_s \leftarrow \theta_s + \alpha\, e,\quad \theta_t \leftarrow \theta_t - \alpha\, e,
           \qquad e = \operatorname{wrap}(\theta_t - \theta_s - f)

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neuroslam import compiled as steps
+from neuroslam.compiled import compiled
 from neuroslam.errors import BadFrame
 from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.sensors.frames import checked_array
@@ -97,6 +99,9 @@ def walls_in_scan(ranges: ArrayLike, reach_m: float, tolerance_m: float = 0.01) 
     found: list[_Wall] = []
     if scan.min() > reach_m + _OUTLIER * tolerance_m:
         return np.empty((0, 2))
+    if steps.ENABLED:
+        rows = find_walls(np.ascontiguousarray(scan), float(reach_m), float(tolerance_m))
+        return rows[np.lexsort((rows[:, 1], rows[:, 0])), :2]
     points = _extended(scan, tolerance_m)
     residual, distance, bearing = _fit_windows(points, scan, reach_m, tolerance_m)
     n, pad = len(scan), points.pad
@@ -333,3 +338,225 @@ def _same(wall: _Wall, other: _Wall, n: int) -> bool:
         (a.bearing_rad / TWO_PI * n + n // 3 - b.first + 0.5) % n <= b.last - b.first + 1
         for a, b in ((wall, other), (other, wall))
     )
+
+
+# --- compiled steps -------------------------------------------------------------------------------
+
+
+@compiled
+def _angle(angle_rad: float) -> float:
+    """Do as :func:`~neuroslam.geometry.wrap_angle`."""
+    return (angle_rad + math.pi) % TWO_PI - math.pi
+
+
+@compiled
+def _largest_rms(tolerance_m: float, free: float) -> float:
+    """Do as ``_max_rms``."""
+    return tolerance_m * (1.0 + 2.5 / math.sqrt(2.0 * free))
+
+
+@compiled
+def _third_of(
+    line: tuple[float, ...], det: float, c0: float, c1: float, cc: float, vc: float, free: int
+) -> tuple[float, float, float, float, float]:
+    """Do as ``_third``; ``line`` has the sums of 1, u, u^2, v, uv and v^2."""
+    s, su, suu, v0, v1, svv = line
+    a0, a1 = (suu * c0 - su * c1) / det, (s * c1 - su * c0) / det
+    own = max(cc - a0 * c0 - a1 * c1, 1e-9 * cc)
+    q2 = (vc - a0 * v0 - a1 * v1) / own
+    q0 = (suu * v0 - su * v1) / det - a0 * q2
+    q1 = (s * v1 - su * v0) / det - a1 * q2
+    squares = svv - q0 * v0 - q1 * v1 - q2 * vc
+    return q0, q1, q2, math.sqrt(max(squares, 0.0) / free), 1.0 / math.sqrt(own)
+
+
+@compiled
+def _fitted(
+    t: tuple[float, ...], count: int, tolerance_m: float
+) -> tuple[float, float, float, float, int, bool]:
+    """Do as ``_fit``, by the sums that :func:`_grown` makes; no degrees of freedom: no wall."""
+    s, su, suu, suuu, s4, sa, sua, saa, sv, suv, suuv, sav, svv = t
+    det = s * suu - su * su
+    if det <= 1e-12 * s * suu:
+        return 0.0, 0.0, 0.0, 0.0, 0, False
+    q0, q1 = (suu * sv - su * suv) / det, (s * suv - su * sv) / det
+    rms = math.sqrt(max(svv - q0 * sv - q1 * suv, 0.0) / (count - 2))
+    if count < _MIN_POINTS + 3:
+        return q0, q1, 0.0, rms, count - 2, False
+    line = (s, su, suu, sv, suv, svv)
+    b0, b1, b2, bent, q2_std = _third_of(line, det, suu, suuu, s4, suuv, count - 3)
+    _, _, k2, kinked, kink_std = _third_of(line, det, sa, sua, saa, sav, count - 3)
+    noise_m = max(kinked, 0.1 * tolerance_m)
+    sharp = k2 > _SHARP * kink_std * noise_m and kinked < bent
+    if abs(b2) > _BENT * q2_std * tolerance_m:
+        return b0, b1, b2, bent, count - 3, sharp
+    return q0, q1, 0.0, rms, count - 2, sharp
+
+
+@compiled
+def _grown(
+    xy: np.ndarray, start: int, end: int, seed: int, distance_m: float, bearing_rad: float,
+    tolerance_m: float, step: float,
+) -> tuple[float, float, int, int]:  # fmt: skip
+    """Do as ``_grow`` on the points from ``start`` to ``end``; a negative distance: no wall."""
+    none = (-1.0, 0.0, 0, 0)
+    curvature, limit, low, high = 0.0, _OUTLIER * tolerance_m, -1, -1
+    rms, free, corner, inside = 0.0, 0, False, False
+    for _ in range(_ROUNDS):
+        c, s = math.cos(-bearing_rad), math.sin(-bearing_rad)
+        before, first, last = (low, high), start, end
+        for side in range(2):  # from the seed on, then back from it
+            k = seed - side
+            while start <= k < end:
+                u, v = s * xy[0, k] + c * xy[1, k], c * xy[0, k] - s * xy[1, k] - distance_m
+                away = (v - curvature * u * u) / limit
+                if 1.0 - away * away < 0.0 or abs(u) > _WALL_M:
+                    break
+                k += 1 - 2 * side
+            if side:
+                first = k + 1
+            else:
+                last = k
+        low, high = first, last
+        if high - low < _MIN_POINTS or not low <= seed < high:
+            return none
+        t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = t8 = t9 = t10 = t11 = t12 = 0.0
+        from_u = to_u = 0.0
+        for k in range(low, high):
+            u, v = s * xy[0, k] + c * xy[1, k], c * xy[0, k] - s * xy[1, k] - distance_m
+            away = (v - curvature * u * u) / limit
+            w, uu, a = 1.0 - away * away, u * u, abs(u)
+            t0 += w
+            t1 += w * u
+            t2 += w * uu
+            t3 += w * uu * u
+            t4 += w * uu * uu
+            t5 += w * a
+            t6 += w * u * a
+            t7 += w * a * a
+            t8 += w * v
+            t9 += w * u * v
+            t10 += w * uu * v
+            t11 += w * a * v
+            t12 += w * v * v
+            if k == low:
+                from_u = u
+            to_u = u
+        sums = (t0, t1, t2, t3, t4, t5, t6, t7, t8, t9, t10, t11, t12)
+        q0, q1, q2, rms, free, corner = _fitted(sums, high - low, tolerance_m)
+        if free == 0:
+            return none
+        along = 0.0
+        for _ in range(3):
+            off = distance_m + q0 + (q1 + q2 * along) * along
+            slope = q1 + 2.0 * q2 * along
+            rise = 1.0 + slope * slope + 2.0 * q2 * off
+            if rise < 0.1:
+                return none
+            along -= (along + off * slope) / rise
+        off = distance_m + q0 + (q1 + q2 * along) * along
+        pitch = off * step
+        inside = from_u - pitch <= along <= to_u + pitch
+        distance_m = math.hypot(along, off)
+        bearing_rad += math.atan2(along, off)
+        curvature = q2
+        if before == (low, high):
+            break
+    if corner or not inside or rms > _largest_rms(tolerance_m, free):
+        return none
+    return distance_m, _angle(bearing_rad), low, high - 1
+
+
+@compiled
+def find_walls(scan: np.ndarray, reach_m: float, tolerance_m: float) -> np.ndarray:
+    """Do as :func:`walls_in_scan` for a checked scan with something near, by plain loops.
+
+    Returns:
+        Distance, bearing, and first and last beam on each wall, ``(m, 4)``, in any order.
+    """
+    n = scan.shape[0]
+    step, pad = TWO_PI / n, n // 3
+    m = n + 2 * pad
+    xy, sums = np.zeros((2, m)), np.zeros((6, m + 1))
+    seen, starts = np.zeros(m, np.bool_), np.zeros(m, np.bool_)
+    first, last = np.zeros(m, np.int64), np.zeros(m, np.int64)
+    for at in range(m):
+        k = (at - pad) % n
+        here, before = scan[k], scan[k - 1 if k else n - 1]
+        seen[at] = here < np.inf
+        starts[at] = not (seen[at] and before < np.inf)
+        if seen[at]:
+            xy[0, at], xy[1, at] = here * math.cos(step * k), here * math.sin(step * k)
+        if not starts[at]:
+            edge = 5.0 * tolerance_m + 4.0 * step * min(here, before)
+            starts[at] = abs(here - before) > edge
+        first[at] = at if starts[at] or at == 0 else first[at - 1]
+        x, y = xy[0, at], xy[1, at]
+        sums[0, at + 1] = sums[0, at] + (1.0 if seen[at] else 0.0)
+        sums[1, at + 1], sums[2, at + 1] = sums[1, at] + x, sums[2, at] + y
+        sums[3, at + 1], sums[4, at + 1] = sums[3, at] + x * x, sums[4, at] + x * y
+        sums[5, at + 1] = sums[5, at] + y * y
+    end = m - 1
+    for at in range(m - 1, -1, -1):
+        last[at] = end
+        if starts[at]:
+            end = at - 1
+    residual, distance, bearing = np.empty(n), np.zeros(n), np.zeros(n)
+    farthest = math.hypot(reach_m, _WINDOW_M) + _OUTLIER * tolerance_m
+    for k in range(n):
+        residual[k] = np.inf
+        if not scan[k] <= farthest:
+            continue
+        r, at = max(scan[k], tolerance_m), pad + k
+        half = min(max(math.ceil(math.atan(_WINDOW_M / r) / step), 2), n // 5)
+        low, high = max(at - half, first[at]), min(at + half, last[at])
+        count = max(sums[0, high + 1] - sums[0, low], 1.0)
+        x, y = (
+            (sums[1, high + 1] - sums[1, low]) / count,
+            (sums[2, high + 1] - sums[2, low]) / count,
+        )
+        xx = (sums[3, high + 1] - sums[3, low]) / count - x * x
+        xy2 = 2.0 * ((sums[4, high + 1] - sums[4, low]) / count - x * y)
+        yy = (sums[5, high + 1] - sums[5, low]) / count - y * y
+        normal = 0.5 * (math.atan2(xy2, xx - yy) + math.pi)
+        d = x * math.cos(normal) + y * math.sin(normal)
+        least = 0.5 * (xx + yy - math.hypot(xx - yy, xy2))
+        bearing[k], distance[k] = normal + (math.pi if d < 0.0 else 0.0), abs(d)
+        free = max(count - 2.0, 1.0)
+        rms = math.sqrt(max(least, 0.0) * count / free)
+        off = abs(_angle(bearing[k] - step * (0.5 * (low + high) - pad)))
+        if (
+            count >= _MIN_POINTS and rms <= _largest_rms(tolerance_m, free)
+            and abs(d) <= reach_m + 2.0 * tolerance_m and off <= step * (0.5 * (high - low) + 0.5)
+        ):  # fmt: skip
+            residual[k] = rms
+    found, n_found, reach = np.empty((n, 4)), 0, n // 3
+    while True:
+        seed = 0
+        for k in range(n):
+            if residual[k] < residual[seed]:
+                seed = k
+        if residual[seed] == np.inf:
+            return found[:n_found]
+        at = pad + seed
+        start, stop = int(max(first[at], at - reach)), int(min(last[at], at + reach)) + 1
+        off_m, towards, low, high = _grown(
+            xy, start, stop, at, distance[seed], bearing[seed], tolerance_m, step
+        )
+        if off_m < 0.0 or off_m > reach_m:
+            for k in range(seed - 1, seed + 2):
+                residual[k % n] = np.inf
+            continue
+        for k in range(low - pad, high + 1 - pad):
+            residual[k % n] = np.inf
+        new = True
+        for other in range(n_found):
+            o_bearing, o_low, o_high = found[other, 1], found[other, 2], found[other, 3]
+            mine = (towards / TWO_PI * n + n // 3 - o_low + 0.5) % n <= o_high - o_low + 1
+            its = (o_bearing / TWO_PI * n + n // 3 - low + 0.5) % n <= high - low + 1
+            if abs(_angle(towards - o_bearing)) < _SAME_RAD and (mine or its):
+                new = False
+        if new:
+            found[n_found, 0], found[n_found, 1] = off_m, towards
+            found[n_found, 2], found[n_found, 3] = low, high
+            n_found += 1

@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, overload
+from itertools import chain
+from operator import is_
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
 import torch
@@ -18,6 +20,9 @@ M = TypeVar("M", bound=nn.Module)
 
 State = dict[str, Tensor]
 """A ``state_dict``, or the part of one that belongs to a module, without its prefix."""
+
+Arrays = tuple[np.ndarray, ...]
+"""Arrays that share the memory of a module's tensors."""
 
 Rule = Callable[[Tensor, Tensor, Join], Tensor]
 """Merge of a loaded and a partial tensor of one name."""
@@ -74,6 +79,32 @@ class BufferModule(QuickModule):
             buffers[name] = value
         else:
             super().__setattr__(name, value)
+
+    def arrays(self) -> Arrays | None:
+        """Return parameters, then buffers, as numpy arrays that share their memory.
+
+        The arrays of a step are kept for the next one, until a tensor is replaced.
+
+        Returns:
+            Contiguous arrays; ``None`` if a tensor is missing or on an accelerator.
+        """
+        tensors = chain(self._parameters.values(), self._buffers.values())
+        kept = self.__dict__.get("_arrays")
+        if kept is not None and all(map(is_, tensors, kept[0])):
+            return kept[1]
+        for name, tensor in self._buffers.items():
+            if tensor is not None and not tensor.is_contiguous():
+                self._buffers[name] = tensor.contiguous()
+        own = [*self._parameters.values(), *self._buffers.values()]
+        if any(t is None or t.device.type != "cpu" or not t.is_contiguous() for t in own):
+            return None
+        arrays = tuple(cast(Tensor, tensor).detach().numpy() for tensor in own)
+        self.__dict__["_arrays"] = own, arrays
+        return arrays
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes: not the arrays, which would not share the copy's memory."""
+        return {name: value for name, value in self.__dict__.items() if name != "_arrays"}
 
 
 class ModulesOf(nn.ModuleList, Generic[M]):

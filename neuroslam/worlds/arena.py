@@ -4,6 +4,7 @@ An outline is ``(n, 2)`` vertices in metres in either sense, the first not repea
 numbers ``(x, y, radius)`` of a circle.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -11,6 +12,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neuroslam import compiled as steps
+from neuroslam.compiled import compiled
 from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
 from neuroslam.worlds.outlines import (
@@ -54,6 +57,53 @@ class _Blockers(NamedTuple):
         at = off - np.sqrt(np.maximum(depth, 0.0))
         behind = (depth > 0.0) & (at > TOUCH_M) & (at < s - TOUCH_M)
         return np.asarray(hidden.any(axis=1) | behind.any(axis=1))
+
+
+@compiled
+def cast_step(
+    points: np.ndarray, headings_rad: np.ndarray, beams_rad: np.ndarray, reach_m: float,
+    n_sides: int, normal: np.ndarray, off: np.ndarray, along: np.ndarray, on: np.ndarray,
+    circles: np.ndarray, is_round: bool, found: np.ndarray,
+) -> None:  # fmt: skip
+    """Do as ``Arena._cast`` for the beams of scans; write the ranges, ``(n, beams)``.
+
+    Points and circles are relative to the origin of the frames of walls.
+    """
+    n_walls = off.shape[0]
+    s, t, side = np.empty(n_walls), np.empty(n_walls), np.empty(n_walls)
+    for p in range(points.shape[0]):
+        x, y = points[p, 0], points[p, 1]
+        for w in range(n_walls):
+            away = x * normal[0, w] + y * normal[1, w] - off[w]
+            t[w] = x * along[0, w] + y * along[1, w] - on[w]
+            side[w] = -1.0 if w >= n_sides and away < 0.0 else 1.0  # free walls have two faces
+            away *= side[w]
+            s[w] = max(away, 0.0) if away >= -TOUCH_M else np.inf
+        for b in range(beams_rad.shape[0]):
+            angle = headings_rad[p] + beams_rad[b]
+            ray_x, ray_y = math.cos(angle), math.sin(angle)
+            first = np.inf
+            for w in range(n_walls):
+                closing = -(normal[0, w] * ray_x + normal[1, w] * ray_y) * side[w]
+                if closing > 0.0 and s[w] < np.inf:
+                    way = s[w] / closing
+                    at = t[w] + way * (along[0, w] * ray_x + along[1, w] * ray_y)
+                    if abs(at) <= 1.0 + TOUCH_M and way < first:
+                        first = way
+            for k in range(circles.shape[0]):
+                out_x, out_y, radius = x - circles[k, 0], y - circles[k, 1], circles[k, 2]
+                ahead = out_x * ray_x + out_y * ray_y
+                q = out_x * out_x + out_y * out_y - radius**2
+                if is_round and k == 0:
+                    way = math.sqrt(ahead * ahead - min(q, 0.0)) - ahead
+                else:
+                    root = ahead * ahead - max(q, 0.0)
+                    if not (root >= 0.0 and ahead < 0.0):
+                        continue
+                    way = -ahead - math.sqrt(root)
+                if way < first:
+                    first = way
+            found[p, b] = first if first <= reach_m else np.inf
 
 
 class Arena:
@@ -378,6 +428,13 @@ class Arena:
             )
         beams = TWO_PI * np.arange(n_beams) / n_beams
         found = np.empty((len(points), n_beams))
+        if steps.ENABLED:
+            circles = self._circles - (*self._origin, 0.0)
+            cast_step(
+                points - self._origin, np.ascontiguousarray(headings), beams, reach,
+                self._n_sides, *self._off, *self._on, circles, self._round, found,
+            )  # fmt: skip
+            return found
         for rows in self._chunks(len(points), n_beams):
             angle = (headings[rows, None] + beams).ravel()
             ray = np.column_stack([np.cos(angle), np.sin(angle)])

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI
 
+_FLAT_M = 1e-300  # rise of a side whose slope is finite
 TOUCH_M = 1e-9
 """A position nearer to a wall than this is at the wall, on its free side."""
 
@@ -99,7 +100,8 @@ def within(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
         return np.asarray(np.hypot(*(points - outline[:2]).T) < outline[2])
     (x0, y0), (x1, y1) = outline.T, np.roll(outline, -1, 0).T
     x, y = points[:, :1], points[:, 1:]
-    slope = (x1 - x0) / np.where(y1 == y0, 1.0, y1 - y0)
+    rise = y1 - y0
+    slope = (x1 - x0) / np.where(np.abs(rise) > _FLAT_M, rise, 1.0)
     crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * slope)
     return np.asarray(np.logical_xor.reduce(crossed, axis=1))
 

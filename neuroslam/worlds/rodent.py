@@ -9,13 +9,15 @@ with the columns ``time_s``, ``x_m`` and ``y_m``.
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neuroslam import compiled as steps
+from neuroslam.compiled import compiled
 from neuroslam.errors import ConfigError, SourceError
-from neuroslam.geometry import TWO_PI, rotate
+from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.images import read_text
 from neuroslam.sensors.tracks import motion_along, parse_table, read_positions, rising
 from neuroslam.worlds.arena import Arena
@@ -32,7 +34,7 @@ _TURN_RAD_S = 0.8  # standard deviation of the turn rate
 _STEER_M = 0.12  # distance below which the agent is steered along a wall
 _CELL_M = 0.01  # cell of the grid of distances to the walls
 _MAX_CELLS = 400_000
-_ESCAPES = [s * math.radians(a) for a in range(20, 181, 20) for s in (1.0, -1.0)]
+_ESCAPES = np.array([0.0, *(s * math.radians(a) for a in range(20, 181, 20) for s in (1.0, -1.0))])
 
 
 @dataclass(frozen=True)
@@ -246,15 +248,55 @@ def roam(
     turns = _TURN_RAD_S * dt * ornstein_uhlenbeck(normals[2], times_s, _TURN_TIME_S)[1:]
     x, y = room.free[generator.integers(len(room.free))].tolist()
     theta = generator.uniform(-math.pi, math.pi)
-    path = [(x, y)]
-    for length, turn in zip(lengths.tolist(), turns.tolist(), strict=True):
-        x, y, theta = room.step(x, y, theta + turn, length)
-        path.append((x, y))
-    return Walk.along(f"walk in {arena.name}", times_s[::fine], np.array(path)[::fine], arena)
+    path = room.walk(x, y, theta, lengths, turns)
+    return Walk.along(f"walk in {arena.name}", times_s[::fine], path[::fine], arena)
+
+
+@compiled
+def walk_steps(
+    path: np.ndarray, theta: float, lengths: np.ndarray, turns: np.ndarray,
+    distance_m: np.ndarray, low_x: float, low_y: float, cell_m: float, margin_m: float,
+    escapes: np.ndarray,
+) -> None:  # fmt: skip
+    """Walk from the first position of a path, steered along walls; write the others to it.
+
+    Where no direction is free, the agent only turns. ``distance_m`` is the distance to the nearest
+    wall on a grid; it is interpolated, once where the agent is, then where it would go.
+    """
+    for k in range(len(lengths)):
+        x, y, length = path[k][0], path[k][1], lengths[k]
+        theta += turns[k]
+        to_x, to_y, heading, side, free = x, y, theta, 1.0, False
+        for attempt in range(len(escapes) + 1):
+            if attempt:
+                heading = theta + side * escapes[attempt - 1]
+                to_x, to_y = x + length * math.cos(heading), y + length * math.sin(heading)
+            u, v = (to_x - low_x) / cell_m, (to_y - low_y) / cell_m
+            i, j = int(u), int(v)
+            a, b = u - i, v - j
+            here, next_ = distance_m[i], distance_m[i + 1]
+            d00, d01, d10, d11 = here[j], here[j + 1], next_[j], next_[j + 1]
+            low = d00 + (d01 - d00) * b
+            distance = low + (d10 + (d11 - d10) * b - low) * a
+            if attempt:
+                if distance >= margin_m:
+                    x, y, free = to_x, to_y, True
+                    break
+                continue
+            gx = ((d10 - d00) * (1.0 - b) + (d11 - d01) * b) / cell_m  # points away from the wall
+            gy = ((d01 - d00) * (1.0 - a) + (d11 - d10) * a) / cell_m
+            c, s = math.cos(-theta), math.sin(-theta)
+            ahead, left = c * gx - s * gy, s * gx + c * gy  # in the agent's frame
+            side = 1.0 if left > 0.0 else -1.0  # to which the smaller turn is away from the wall
+            if distance < _STEER_M and ahead < 0.0:
+                room = max(distance - margin_m, 0.1 * cell_m)
+                theta += side * min(length / room, 1.0) * -ahead
+        theta = (heading if free else theta + side) % TWO_PI
+        path[k + 1][0], path[k + 1][1] = x, y
 
 
 class _Room:
-    """Distances to the nearest wall of an arena on a grid, negative outside, and steps in it.
+    """Distances to the nearest wall of an arena on a grid, negative outside, and walks in it.
 
     The distance changes by at most one metre per metre, so its interpolation is accurate to 0.71
     cells, and a position at two cells from the walls is at least 1.29 cells from them.
@@ -282,36 +324,24 @@ class _Room:
                 f"{arena.name}: no position is {1.5 * self.margin_m:g} m from its walls; expected "
                 "a larger arena"
             )
+        self.distance_m = distance.reshape(nx, ny)
+
+    def walk(
+        self, x: float, y: float, theta: float, lengths: np.ndarray, turns: np.ndarray
+    ) -> np.ndarray:
+        """Return the positions of a walk from a pose, ``(n + 1, 2)``."""
+        path = np.empty((len(lengths) + 1, 2))
+        path[0] = x, y
+        lengths, turns = map(np.ascontiguousarray, (lengths, turns))
+        given: list[Any] = [path, theta, lengths, turns, self.distance_m]
+        given += [*self.low, self.cell_m, self.margin_m, _ESCAPES]
+        if steps.ENABLED:
+            walk_steps(*given)
+            return path
         # Nested lists: reading single numbers is five times as fast as from an array.
-        self.distance_m = distance.reshape(nx, ny).tolist()
-
-    def distance_at(self, x: float, y: float) -> tuple[float, float, float]:
-        """Return the distance to the nearest wall, and its gradient, which points away from it."""
-        u, v = (x - self.low[0]) / self.cell_m, (y - self.low[1]) / self.cell_m
-        i, j = int(u), int(v)
-        a, b = u - i, v - j
-        here, next_ = self.distance_m[i], self.distance_m[i + 1]
-        d00, d01, d10, d11 = here[j], here[j + 1], next_[j], next_[j + 1]
-        gx = ((d10 - d00) * (1.0 - b) + (d11 - d01) * b) / self.cell_m
-        gy = ((d01 - d00) * (1.0 - a) + (d11 - d10) * a) / self.cell_m
-        low = d00 + (d01 - d00) * b
-        return low + (d10 + (d11 - d10) * b - low) * a, gx, gy
-
-    def step(self, x: float, y: float, theta: float, length: float) -> tuple[float, float, float]:
-        """Take one step, steered along the walls; if no direction is free, only turn."""
-        distance, gx, gy = self.distance_at(x, y)
-        ahead, left = rotate(gx, gy, -theta)  # the gradient in the agent's frame
-        approach = -ahead
-        side = 1.0 if left > 0.0 else -1.0  # side to which the smaller turn is away from the wall
-        if distance < _STEER_M and approach > 0.0:
-            room = max(distance - self.margin_m, 0.1 * self.cell_m)
-            theta += side * min(length / room, 1.0) * approach
-        for escape in (0.0, *_ESCAPES):
-            heading = theta + side * escape
-            to_x, to_y = x + length * math.cos(heading), y + length * math.sin(heading)
-            if self.distance_at(to_x, to_y)[0] >= self.margin_m:
-                return to_x, to_y, heading % TWO_PI
-        return x, y, (theta + side) % TWO_PI
+        slow = [part.tolist() if isinstance(part, np.ndarray) else part for part in given]
+        walk_steps.plain(*slow)
+        return np.array(slow[0])
 
 
 def ratinabox_walk(arena: Arena, minutes: float, seed: int, rate_hz: float = 20.0) -> Walk:

@@ -7,7 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroslam.cells import grid
-from neuroslam.cells.grid import LAHNGridCells, LAHNWeights, lahn_drive, lahn_learn
+from neuroslam.cells.convolve import convolve_axes, gaussian_kernel
+from neuroslam.cells.grid import (
+    LAHNGridCells,
+    LAHNWeights,
+    lahn_drive,
+    lahn_learn,
+    lateral_kernel,
+    sheet_of,
+)
 from neuroslam.cells.oscillators import (
     VelocityOscillators,
     decode_phases,
@@ -418,3 +426,44 @@ def test_learning_online_on_a_walk_keeps_the_hexagons(grown):
             cells(oscillators.shift(torch.from_numpy(step)))
     assert not torch.equal(cells.feedforward, grown.feedforward)
     assert (medians(cells, CONFIG) > 1.2).all()
+
+
+@given(n_cells=st.integers(1, 30), seed=seeds)
+@settings(max_examples=40, deadline=None)
+def test_the_lateral_kernel_is_a_convolution_on_the_sheet_that_excites_as_much_as_it_inhibits(
+    n_cells, seed
+):
+    config = GridCellConfig(n_cells=n_cells, excitation=1.5, inhibition=0.5)
+    rates = torch.rand(n_cells, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    sheet, odd = sheet_of(n_cells), [n - 1 + n % 2 for n in sheet_of(n_cells)]
+    near, far = (
+        convolve_axes(rates.reshape(sheet), [gaussian_kernel(size, std) for size in sizes])
+        for sizes, std in (([min(5, n) for n in odd], 1.0), (odd, 2.0))
+    )
+    kernel = lateral_kernel(config)
+    torch.testing.assert_close(kernel @ rates, (1.5 * near - 0.5 * far).flatten())
+    torch.testing.assert_close(kernel.sum(1), torch.ones(n_cells, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("lateral", ["kernel", "both"])
+def test_with_a_kernel_neighbours_on_the_sheet_fire_alike_and_fields_stay_hexagonal(lateral, grown):
+    config = GridCellConfig(lateral=lateral)
+    cells = LAHNGridCells(config)
+    assert (medians(cells, config) > medians(grown, CONFIG) - 0.02).all()
+    rows, columns = sheet_of(config.n_cells)
+    apart = np.zeros((rows, columns, rows, columns), int)
+    for axis, n in ((0, rows), (1, columns)):
+        away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        apart += np.expand_dims(np.minimum(away, n - away), (1, 3) if axis == 0 else (0, 2))
+    apart = apart.reshape(config.n_cells, -1)
+    positions = 4.0 * torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)).double()
+    phases = phases_at(positions, CONFIG)
+    alike = {}
+    for name, network in (("kernel", cells), ("learned", grown)):
+        with torch.no_grad():
+            drive = phases.flatten(-2).float().unsqueeze(-2) @ network.feedforward.mT
+            rates = (drive.squeeze(-2) - network.bias).clamp_min(0.0).numpy()
+        maps = [np.corrcoef(rates[:, m].T) for m in range(len(config.spacings_m))]
+        alike[name] = min(m[apart == 1].mean() - m[apart >= 3].mean() for m in maps)
+    assert alike["kernel"] > 0.4
+    assert alike["learned"] < 0.2

@@ -13,6 +13,8 @@ from neuroslam.cells.place import (
     FAR_M,
     NEIGHBOURS,
     CompetitiveHebbianPlaceCells,
+    bump_of,
+    excited,
     hebbian_step,
     place_response,
 )
@@ -302,3 +304,57 @@ def test_a_response_falls_with_distance_and_mismatch(seed, power, sigma):
     farther = place_response(weights, near + sigma**2, weights[3], power, sigma)
     torch.testing.assert_close(farther, here * math.exp(-0.5))
     assert place_response(-weights[3:4], near[:1], weights[3], power, sigma).item() == 0.0
+
+
+@given(seed=seeds, gain=st.floats(0.0, 5.0), inhibition=st.floats(0.0, 0.99))
+@settings(max_examples=40, deadline=None)
+def test_a_bump_has_sum_one_and_a_narrow_kernel_keeps_the_winner(seed, gain, inhibition):
+    generator = torch.Generator().manual_seed(seed)
+    response = torch.rand(12, generator=generator, dtype=torch.float64)
+    centres = torch.rand(12, 2, generator=generator, dtype=torch.float64)
+    narrow = excited(response, centres, gain, 1e-6)
+    torch.testing.assert_close(narrow, (1.0 + gain) * response)
+    bump = bump_of(excited(response, centres, gain, 0.2), inhibition)
+    assert bump.min() >= 0.0
+    assert bump.sum().item() == pytest.approx(1.0)
+    alone = bump_of(narrow, 1.0 - 1e-12)
+    assert alone.argmax() == response.argmax()
+    assert alone.max().item() == pytest.approx(1.0)
+
+
+def test_excitation_does_not_depend_on_the_order_or_the_place_of_the_cells():
+    generator = torch.Generator().manual_seed(1)
+    response = torch.rand(9, generator=generator, dtype=torch.float64)
+    centres = torch.rand(9, 2, generator=generator, dtype=torch.float64)
+    order = torch.randperm(9, generator=generator)
+    once = excited(response, centres, 0.5, 0.1)
+    torch.testing.assert_close(excited(response[order], centres[order], 0.5, 0.1), once[order])
+    torch.testing.assert_close(excited(response, centres + 3.0, 0.5, 0.1), once)
+    assert (once >= response).all()
+
+
+def test_gradients_reach_the_responses_and_the_centres_through_the_kernel():
+    response = torch.rand(5, dtype=torch.float64, requires_grad=True)
+    centres = torch.rand(5, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda p, x: bump_of(excited(p, x, 0.5, 0.3), 0.1), (response, centres)
+    )
+
+
+def test_the_bump_says_more_exactly_than_the_winner_where_the_animal_is(patterns):
+    walk = strides("pentagon", 20, seed=4)
+    grid, far, n_cells = patterns(walk), {}, set()
+    for gain in (0.0, 0.5):
+        cells = new_cells(PlaceCellConfig(power=10.0, excitation=gain))
+        found = []
+        for k, (rates, position) in enumerate(zip(grid, walk, strict=True)):
+            winner = cells.centre_of(cells(rates, position, 0.5).winner)
+            if k > len(walk) // 2:
+                bump, centre = cells.bump(rates, position)
+                assert bump.shape == (cells.n_cells.item(),)
+                found.append([(x - position).norm().item() for x in (winner, centre)])
+        far[gain] = np.mean(found, axis=0)
+        n_cells.add(cells.n_cells.item())
+    assert len(n_cells) == 1, "cells are recruited by distance, whatever the kernel"
+    assert far[0.5][1] < 0.8 * far[0.5][0]
+    assert far[0.5][1] < 0.95 * far[0.0][1]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuroslam.experiments import place_bump, place_methods
 from neuroslam.experiments import place_cells as experiment
-from neuroslam.experiments import place_methods
 from neuroslam.experiments.animals import read_track, run_cells, simulate
 from neuroslam.figures.place_errors import Spread
 from neuroslam.worlds.senses import NO_NOISE, SenseNoise, sense
@@ -163,3 +163,12 @@ def test_links_join_successive_places_once():
 def test_growth_is_that_of_the_last_third():
     cells = Spread(np.linspace(0.0, 30.0, 4), np.array([[1, 50, 100, 103], [1, 50, 200, 200]]))
     np.testing.assert_allclose(experiment.growth_percent(cells), [3.0, 0.0])
+
+
+def test_a_bump_of_place_cells_is_nearer_than_the_winner(data, tmp_path):
+    rows = place_bump.place_bump(data, tmp_path, MINUTES, SEEDS, ("nonagon",))["rows"]
+    wins, plain, excited = rows
+    assert [row["cells_in_bump"] >= 1.0 for row in rows] == [True] * 3
+    assert excited["bump_error_m"] < plain["bump_error_m"] < wins["winner_error_m"]
+    assert {row["place_cells"] for row in rows} == {wins["place_cells"]}
+    assert (tmp_path / "errors.png").stat().st_size > 10_000
