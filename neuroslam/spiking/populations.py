@@ -215,7 +215,7 @@ class VelocityPopulation(BufferModule):
         direction = direction / direction.norm(dim=-1, keepdim=True)
         share = torch.rand(1, _SOLVER_POINTS, 1, generator=draw).pow(1.0 / dimension)
         velocity = max_speed_m_s * share * direction
-        decoders = solve_decoders(self.neurons.rates(velocity), velocity, decoder_noise)
+        decoders = self.neurons.solve(velocity, velocity, decoder_noise)
         self.register_buffer("decoders", decoders / time_step_s)
         self.register_buffer("decoded", torch.zeros(batch, dimension))
 
