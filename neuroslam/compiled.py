@@ -12,6 +12,7 @@ import types
 from collections.abc import Callable
 from typing import Any, Generic, ParamSpec, TypeVar
 
+import numpy as np
 from torch import Tensor
 
 P = ParamSpec("P")
@@ -106,4 +107,20 @@ def runs_compiled(*tensors: Tensor) -> bool:
         >>> runs_compiled(torch.zeros(2, requires_grad=True))
         False
     """
-    return ENABLED and not any(t.requires_grad or t.device.type != "cpu" for t in tensors)
+    if not ENABLED:
+        return False
+    for tensor in tensors:  # noqa: SIM110 - a generator takes longer
+        if tensor.requires_grad or not tensor.is_cpu:
+            return False
+    return True
+
+
+def plain_array(array: np.ndarray) -> np.ndarray:
+    """Return an array that is contiguous and may be written, itself where it is: one type of it.
+
+    Example:
+        >>> plain_array(np.zeros((4, 6))[:, ::2]).flags.c_contiguous
+        True
+    """
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else array.copy()

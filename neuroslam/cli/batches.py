@@ -166,12 +166,20 @@ def experiment_command(
             "repeatable.",
         ),
     ] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NN",
+            help="ssp-kitti: KITTI odometry sequence, 00 to 10; --data holds kitti_NN, or KITTI's "
+            "own poses and sequences.",
+        ),
+    ] = None,
 ) -> int:
     """Reproduce an experiment of a paper."""
     from neuroslam.experiments import run_experiment
 
     networks = dict(_name_and_file(text) for text in network or [])
-    rows = run_experiment(name, data, out, jobs, ray, networks)
+    rows = run_experiment(name, data, out, jobs, ray, networks, sequence)
     few = len({key for row in rows for key in row}) <= 9
     for table in [down(rows, name)] if few else across(rows, name):
         say(table)

@@ -76,11 +76,18 @@ def ask_command(
         return 0
     if answer.found:
         extra = {"at": ["distance (m)"], "box": ["share in box"]}.get(answer.question.form, [])
-        table = new_table("name", "x (m)", "y (m)", *extra, "kind", "words", title=question)
+        uncertain = any(one.covariance_m2 for one in answer.found)
+        spread = ["sd (m)"] if uncertain else []
+        table = new_table(
+            "name", "x (m)", "y (m)", *spread, *extra, "kind", "words", title=question
+        )
         for one in answer.found:
             number = one.share if answer.question.form == "box" else one.distance_m
             x, y = one.position_m
             more = [f"{number:.2f}"] if extra else []
+            if uncertain:
+                long, short = one.sigma_m
+                more.insert(0, f"{long:.2f} x {short:.2f}" if one.covariance_m2 else "")
             table.add_row(one.name, f"{x:.2f}", f"{y:.2f}", *more, one.kind, one.words)
         say(table)
     if answer.note:

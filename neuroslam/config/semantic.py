@@ -327,11 +327,39 @@ class SSPSLAMConfig(Section):
         description="time for which known landmarks must contradict the position before the animal "
         "relocalises by them; larger: later, fewer mistakes; 0: never",
     )
+    sigma_distance_m: float = Field(
+        default=0.0,
+        ge=0,
+        description="standard deviation of a landmark's measured distance, learnt with its "
+        "position; larger: broader memories, which correct less; 0: exact",
+    )
+    sigma_bearing_rad: float = Field(
+        default=0.0,
+        ge=0,
+        description="the same of its measured bearing; larger: far landmarks are less certain "
+        "across the line of sight; 0: exact",
+    )
     quantised: bool = Field(
         default=False,
         description="weights of 8 bits and neurons of a neuromorphic chip, no function outside of "
         "neurons",
     )
+
+    @property
+    def has_uncertain_sightings(self) -> bool:
+        """Whether sightings of landmarks have a standard deviation."""
+        return self.sigma_distance_m > 0 or self.sigma_bearing_rad > 0
+
+    @model_validator(mode="after")
+    def _uncertainty_has_one_landmark(self) -> Self:
+        if self.has_uncertain_sightings and (self.attention == "sum" or self.quantised):
+            what = "quantised = true" if self.quantised else "attention = 'sum'"
+            raise ValueError(
+                f"sigma_distance_m is {self.sigma_distance_m}, sigma_bearing_rad "
+                f"{self.sigma_bearing_rad}, with {what}; expected both 0 there: several landmarks "
+                "as one, or neurons alone, have no uncertainty of their own"
+            )
+        return self
 
 
 class RoomSpaceConfig(SSPSpaceConfig):

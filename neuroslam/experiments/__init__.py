@@ -58,6 +58,7 @@ def run_experiment(
     jobs: int | None = None,
     ray: str | None = None,
     networks: Mapping[str, Path] | None = None,
+    sequence: str | None = None,
 ) -> list[dict[str, Any]]:
     """Run an experiment and return its rows; their keys carry units.
 
@@ -68,10 +69,11 @@ def run_experiment(
         jobs: As for :func:`neuroslam.runs.parallel.parallel_map`, for independent simulations.
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
         networks: ``view.features`` -> file of weights, for experiments that compare views.
+        sequence: Number of a KITTI sequence, for experiments on one; ``None``: 00.
 
     Raises:
         RunError: If there is no such experiment, its recording is missing, or it has no independent
-            simulations or views for ``jobs``, ``ray`` or ``networks``.
+            simulations, views or sequences for ``jobs``, ``ray``, ``networks`` or ``sequence``.
     """
     if name not in EXPERIMENTS:
         raise RunError(
@@ -79,6 +81,20 @@ def run_experiment(
             f"{did_you_mean(name, EXPERIMENTS)}"
         )
     module, function, folder = EXPERIMENTS[name]
+    experiment = getattr(import_module(module), function)
+    options: dict[str, Any] = {}
+    if sequence is not None:
+        from neuroslam.worlds.landmark_paths import KITTI_SEQUENCES
+
+        if "sequence" not in signature(experiment).parameters:
+            raise RunError(f"{name}: has one recording only; leave --sequence out")
+        if sequence not in KITTI_SEQUENCES:
+            raise RunError(
+                f"{name}: no sequence {sequence!r} with published poses; expected one of "
+                f"{', '.join(KITTI_SEQUENCES)}"
+            )
+        options["sequence"] = sequence
+        folder = _folder_of(folder, sequence, data)
     recordings = None
     if folder is None and data is not None and name in _OPTIONAL:
         optional = Path(data) / _OPTIONAL[name]
@@ -89,8 +105,6 @@ def run_experiment(
         recordings = Path(data) / folder
         if not recordings.is_dir():
             raise RunError(f"{recordings}: no such recording; give its parent folder with --data")
-    experiment = getattr(import_module(module), function)
-    options: dict[str, Any] = {}
     if networks:
         if "networks" not in signature(experiment).parameters:
             raise RunError(f"{name}: compares no views; leave --network out")
@@ -101,3 +115,11 @@ def run_experiment(
         options |= {"jobs": jobs, "ray": ray}
     rows: list[dict[str, Any]] = experiment(recordings, Path(out), **options)["rows"]
     return rows
+
+
+def _folder_of(folder: str | None, sequence: str, data: Path | None) -> str | None:
+    """Return the folder of a sequence in the data: its own, or the data itself."""
+    own = None if folder is None else f"{folder.rpartition('_')[0]}_{sequence}"
+    if own is None or data is None or (Path(data) / own).is_dir():
+        return own
+    return "." if (Path(data) / "poses").is_dir() else own

@@ -1,4 +1,4 @@
-"""Dead reckoning by SSP-SLAM's oscillators along KITTI 00, in floating point and quantised."""
+"""Dead reckoning by SSP-SLAM's oscillators along KITTI, in floating point and quantised."""
 
 from pathlib import Path
 from typing import Any
@@ -24,23 +24,26 @@ def ssp_kitti(
     out_folder: Path,
     seconds: float = 60.0,
     budgets: tuple[int, ...] = (PAPER_NEURONS, PAPER_NEURONS // 10),
+    sequence: str = "00",
 ) -> dict[str, Any]:
     """Integrate the velocity along a KITTI sequence in three dimensions (Fig. 11).
 
-    The sequence of 471 s is compressed in time: neurons represent a range of speeds, and in a box
-    of side 1.8 the speed of the original would be hardly above their drift.
+    The sequence (00 lasts 471 s) is compressed in time: neurons represent a range of speeds, and in
+    a box of side 1.8 the speed of the original would be hardly above their drift.
 
     Args:
-        data_folder: Folder of KITTI 00's poses and times.
+        data_folder: Folder of the poses and times; see
+            :func:`~neuroslam.worlds.landmark_paths.kitti_files`.
         out_folder: ``results.json`` and ``reckoning.png`` are written there.
         seconds: Duration of the whole sequence after compression.
         budgets: Total numbers of neurons.
+        sequence: Number of the sequence, 00 to 10: those whose true poses are published.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each integrator.
     """
     out = Path(out_folder)
-    path = _in_time(read_kitti(data_folder, time_step_s=0.05), seconds)
+    path = _in_time(read_kitti(data_folder, sequence, time_step_s=0.05), seconds)
     rows, runs = [], []
     for budget in budgets:
         for chip in (False, True):
@@ -62,9 +65,13 @@ def ssp_kitti(
     every = round(0.1 / path.time_step_s)
     at = path.position_m[every - 1 :: every]
     truth = Run("truth", path.time_s[every - 1 :: every], at, np.zeros(len(at)))
-    title = f"Dead reckoning on KITTI 00 in three dimensions (1 m is {path.metres:.0f} m of KITTI)"
+    title = (
+        f"Dead reckoning on KITTI {sequence} in three dimensions "
+        f"(1 m is {path.metres:.0f} m of KITTI)"
+    )
     save(plot_dead_reckoning(truth, runs, title), out / "reckoning.png")
-    return write_results(out, {"seconds": seconds, "metres_per_unit": path.metres, "rows": rows})
+    about = {"sequence": sequence, "seconds": seconds, "metres_per_unit": path.metres}
+    return write_results(out, {**about, "rows": rows})
 
 
 def _in_time(path: LandmarkPath, seconds: float, time_step_s: float = 1e-3) -> LandmarkPath:

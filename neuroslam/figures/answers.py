@@ -11,8 +11,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
 from neuroslam.errors import counted
+from neuroslam.figures.density import SIGMAS, Spread, draw_ellipse
 from neuroslam.figures.landmarks import style_of_words
-from neuroslam.figures.style import INK, LOOP, ODOMETRY, STYLE, WALL, new_figure, write_title
+from neuroslam.figures.style import (
+    INK,
+    LOOP,
+    MAP,
+    ODOMETRY,
+    STYLE,
+    WALL,
+    new_figure,
+    write_title,
+)
 from neuroslam.spiking.ask import Answer, Found
 
 _LABELLED = 40  # landmarks; more are labelled only if they are found
@@ -32,7 +42,7 @@ def plot_answer(answer: Answer, positions_m: np.ndarray, links: np.ndarray) -> F
         size = high - low
         scale = min(9.0 / float(size[0]), 7.0 / float(size[1]))  # inches a metre
         width, height = np.maximum(scale * size, (3.2, 1.6)).tolist()
-        figure = new_figure(width + 0.8, height + 1.2, None)  # room for labels, title, legend
+        figure = new_figure(width + 0.8, height + 1.6, None)  # room for labels, title, legend
         axes = figure.subplots()
         if len(links):
             lines = LineCollection([*positions_m[links]], colors=ODOMETRY, lw=0.8, zorder=1)
@@ -58,6 +68,10 @@ def _extent(answer: Answer, positions_m: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return the corners of the plane that is drawn."""
     points: list[Any] = [positions_m, *([one.position_m] for one in answer.everything)]
     points += [one.corners_m for one in answer.everything if one.corners_m]
+    for one in answer.everything:
+        if one.covariance_m2:
+            half = SIGMAS[-1] * np.sqrt(np.diagonal(np.array(one.covariance_m2)))
+            points.append(np.array(one.position_m) + np.stack([-half, half]))
     if answer.question.numbers:
         points.append(np.reshape(answer.question.numbers, (-1, 2)))
     every = np.concatenate([np.reshape(p, (-1, 2)) for p in points if len(p)] or [np.zeros((1, 2))])
@@ -80,6 +94,10 @@ def _draw(axes: Axes, one: Found, is_found: bool) -> None:
     else:
         style: dict[str, Any] = {"ls": "none", "ms": 9, "mec": "white", "mew": 0.9, "zorder": 6}
         axes.plot(*one.position_m, **style, **style_of_words(one.words), **strong)
+    if one.covariance_m2:
+        spread = Spread(np.array(one.position_m), np.array(one.covariance_m2))
+        label = _once(axes, "1 and 2 standard deviations")
+        draw_ellipse(axes, spread, label=label, colour=MAP if is_found else ODOMETRY)
     if is_found and one.kind == "landmark":
         ring: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 16, "mfc": "none", "mew": 1.4}
         axes.plot(*one.position_m, mec=LOOP, zorder=7, label=_once(axes, "found"), **ring)

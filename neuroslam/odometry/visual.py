@@ -5,13 +5,14 @@ A turn to the left shifts the image to the right: see ``docs/sign_conventions.md
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from neuroslam.compiled import compiled, plain_array, runs_compiled
 from neuroslam.config.sections import OdometryConfig, Region, region_in
 from neuroslam.errors import BadFrame, ConfigError
 from neuroslam.sensors.frames import check_image
@@ -68,6 +69,8 @@ def match_profiles(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tup
         >>> match_profiles(np.array([9.0, 1, 2, 7, 3]), np.array([1.0, 2, 7, 3, 5]), 3)
         (1, 0.0)
     """
+    if runs_compiled() and now.dtype == previous.dtype == np.int32:
+        return match_step(plain_array(now), plain_array(previous), max_shift)
     n = len(now)
     overlap, counts, shifts, order = _offsets(n, max_shift)
     padded = np.zeros(n + 2 * (max_shift - 1))
@@ -91,6 +94,65 @@ def _offsets(n: int, max_shift: int) -> tuple[np.ndarray, ...]:
     zero = max_shift - 1
     order = np.concatenate([np.arange(zero, 2 * max_shift - 1), np.arange(zero - 1, -1, -1)])
     return overlap, overlap.sum(axis=1), shifts, order
+
+
+@compiled
+def match_step(now: np.ndarray, previous: np.ndarray, max_shift: int) -> tuple[int, float]:
+    """Match column sums, ``int32``, as :func:`match_profiles` does."""
+    n = now.shape[0]
+    best, smallest = 0, math.inf
+    for trial in range(2 * max_shift - 1):  # 0, -1, ..., and then 1, 2, ...
+        shift = -trial if trial < max_shift else trial - max_shift + 1
+        count = n - abs(shift)
+        first, second = now[max(0, shift) :], previous[max(0, -shift) :]
+        total = np.int64(0)
+        for i in range(count):
+            total += abs(np.int64(first[i]) - np.int64(second[i]))
+        mean = total / count
+        if mean < smallest:
+            best, smallest = shift, mean
+    return best, smallest
+
+
+@compiled
+def measure_step(
+    image: np.ndarray,
+    speed_region: Region,
+    turn_region: Region,
+    speed_before: np.ndarray,
+    turn_before: np.ndarray,
+    max_shift: int,
+) -> tuple[np.ndarray, np.ndarray, int, float]:
+    """Sum the columns of both regions of an image, and match them with those before.
+
+    Args:
+        image: ``uint8``, ``(h, w)``.
+        speed_region: As for :func:`profile`.
+        turn_region: The same.
+        speed_before: Column sums of the image before, ``int32``; empty: there is none.
+        turn_before: The same of the other region.
+        max_shift: As for :func:`match_profiles`.
+
+    Returns:
+        Column sums of both regions; shift of the turn region; difference of the speed region.
+    """
+    speed, turn = _column_sums(image, speed_region), _column_sums(image, turn_region)
+    if speed_before.shape[0] == 0:
+        speed_before, turn_before = np.zeros_like(speed), np.zeros_like(turn)
+    shift, _ = match_step(turn, turn_before, max_shift)
+    _, difference = match_step(speed, speed_before, max_shift)
+    return speed, turn, shift, difference
+
+
+@compiled
+def _column_sums(image: np.ndarray, region: Region) -> np.ndarray:
+    x_min, x_max, y_min, y_max = region
+    sums = np.zeros(x_max - x_min, np.int32)
+    for y in range(y_min, y_max):
+        row = image[y, x_min:x_max]
+        for x in range(sums.shape[0]):
+            sums[x] += row[x]
+    return sums
 
 
 def motion_from_match(
@@ -195,36 +257,57 @@ class VisualOdometry(AboutNow):
         check_image(image, "VisualOdometry")
         image = to_grey(image, self.grey)
         height, width = image.shape
-        first = self.size.height == 0
-        if not first and (height, width) != (self.size.height, self.size.width):
+        size = self.size
+        first = size.height == 0
+        if not first and (height, width) != (size.height, size.width):
             raise BadFrame(
                 f"VisualOdometry: image is {width} x {height} px; expected "
-                f"{self.size.width} x {self.size.height} px as in the frames before it"
+                f"{size.width} x {size.height} px as in the frames before it"
             )
         if self._regions is None or self._regions[0] != (height, width):
             self._regions = (height, width), regions_in(height, width, self.config)
         speed_region, turn_region = self._regions[1]
-        now = Profiles(
-            height, width, column_sums(image, speed_region), column_sums(image, turn_region)
-        )
-        if first and self.config.first_frame == "still":
-            return Velocity(0.0, 0.0), now
-        speed_before = np.zeros_like(now.speed) if first else self.speed_sums.cpu().numpy()
-        turn_before = np.zeros_like(now.turn) if first else self.turn_sums.cpu().numpy()
-        max_shift = self.config.max_shift_px
-        shift, _ = match_profiles(now.turn, turn_before, max_shift)
-        _, difference = match_profiles(now.speed, speed_before, max_shift)
+        max_shift, still = self.config.max_shift_px, first and self.config.first_frame == "still"
+        before = self._last
+        if runs_compiled(*before):
+            speed, turn, shift, difference = measure_step(
+                plain_array(image),
+                speed_region,
+                turn_region,
+                before[0].numpy(),
+                before[1].numpy(),
+                max_shift,
+            )
+            now = Profiles(height, width, speed, turn)
+            if still:
+                return Velocity(0.0, 0.0), now
+        else:
+            now = Profiles(
+                height, width, column_sums(image, speed_region), column_sums(image, turn_region)
+            )
+            if still:
+                return Velocity(0.0, 0.0), now
+            speed_before = np.zeros_like(now.speed) if first else before[0].cpu().numpy()
+            turn_before = np.zeros_like(now.turn) if first else before[1].cpu().numpy()
+            shift, _ = match_profiles(now.turn, turn_before, max_shift)
+            _, difference = match_profiles(now.speed, speed_before, max_shift)
         difference /= 255.0 * (speed_region[3] - speed_region[2])
         return motion_from_match(shift, difference, width, dt_s, self.config), now
 
     def remember(self, profiles: Profiles) -> None:
         """Keep the profiles of an image for the comparison with the next."""
-        if self.size.height == 0:
-            self.size.height, self.size.width = profiles.height, profiles.width
-        # Into _buffers: setting an attribute of a module takes longer than matching a profile.
-        device = self.speed_sums.device
-        self._buffers["speed_sums"] = torch.from_numpy(profiles.speed).to(device)
-        self._buffers["turn_sums"] = torch.from_numpy(profiles.turn).to(device)
+        size = self.size
+        if size.height == 0:
+            size.height, size.width = profiles.height, profiles.width
+        device = self._last[0].device
+        for name, sums in (("speed_sums", profiles.speed), ("turn_sums", profiles.turn)):
+            self._buffers[name] = torch.from_numpy(sums).to(device)
+
+    @property
+    def _last(self) -> tuple[Tensor, Tensor]:
+        """Buffers, past ``nn.Module``, whose attributes take longer than matching a profile."""
+        buffers = cast(dict[str, Tensor], self._buffers)
+        return buffers["speed_sums"], buffers["turn_sums"]
 
 
 def regions_in(height: int, width: int, config: OdometryConfig) -> tuple[Region, Region]:

@@ -5,6 +5,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from neuroslam.compiled import compiled, plain_array, runs_compiled
 from neuroslam.types import GreyRule
 
 _THIRDS = np.full((1, 3), 1.0 / 3.0)
@@ -38,5 +39,17 @@ def to_grey(
     if image.ndim == 2:
         return image
     if rule == "mean":
+        if runs_compiled() and image.dtype == np.uint8 and image.shape[2:] == (3,):
+            grey = np.empty(image.shape[:2], np.uint8)
+            mean_step(plain_array(image).reshape(-1), grey.reshape(-1))
+            return grey
         return cv2.transform(image, _THIRDS)
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY if channels == "rgb" else cv2.COLOR_BGR2GRAY)
+
+
+@compiled
+def mean_step(colour: np.ndarray, grey: np.ndarray) -> None:
+    """Write the mean of each three bytes, rounded; a mean of three has no tie."""
+    for i in range(grey.shape[0]):
+        total = np.uint16(colour[3 * i]) + np.uint16(colour[3 * i + 1]) + colour[3 * i + 2]
+        grey[i] = np.uint8(np.uint16(total + 1) // np.uint16(3))

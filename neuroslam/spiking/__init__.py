@@ -5,6 +5,7 @@ from neuroslam.spiking.algebraic import AlgebraicIntegrator, AlgebraicMap
 from neuroslam.spiking.associative import AssociativeMap
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.decoding import LearnedDecoder, PositionDecoder
+from neuroslam.spiking.density import DensityEstimator
 from neuroslam.spiking.ensemble import NeuronArray
 from neuroslam.spiking.files import load_semantic_map, save_semantic_map
 from neuroslam.spiking.joining import merge_semantic_maps
@@ -20,6 +21,7 @@ __all__ = [
     "AlgebraicIntegrator",
     "AlgebraicMap",
     "AssociativeMap",
+    "DensityEstimator",
     "LearnedDecoder",
     "NeuronArray",
     "PathIntegrator",

@@ -63,6 +63,8 @@ class Found(NamedTuple):
         distance_m: From the position asked for; NaN if none was.
         share: Share of it in the box asked for; NaN if none was.
         strength: Strength of its recall, 1 for a whole one; of the weakest corner.
+        covariance_m2: Covariance of the position of a landmark, rows of ``(2, 2)``, see
+            :meth:`~neuroslam.spiking.slam.SSPSLAM.uncertainty`; none if sightings are exact.
     """
 
     name: str
@@ -73,11 +75,29 @@ class Found(NamedTuple):
     distance_m: float = math.nan
     share: float = math.nan
     strength: float = 1.0
+    covariance_m2: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def sigma_m(self) -> tuple[float, float]:
+        """Standard deviations along the longer and the shorter axis of its uncertainty ellipse.
+
+        Example:
+            >>> rows = (1.0, 0.0), (0.0, 4.0)
+            >>> Found("DOOR", "landmark", "", (0.0, 0.0), covariance_m2=rows).sigma_m
+            (2.0, 1.0)
+        """
+        if not self.covariance_m2:
+            return math.nan, math.nan
+        small, large = np.sqrt(np.linalg.eigvalsh(self.covariance_m2).clip(0.0)).tolist()
+        return large, small
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that are known, for JSON."""
         fields = {k: list(v) if k == "position_m" else v for k, v in self._asdict().items()}
         fields["corners_m"] = [list(corner) for corner in self.corners_m]
+        fields["covariance_m2"] = [list(row) for row in self.covariance_m2]
+        if not self.covariance_m2:
+            del fields["covariance_m2"]
         return {k: v for k, v in fields.items() if not (isinstance(v, float) and math.isnan(v))}
 
 
@@ -230,8 +250,10 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> Contents:
     with torch.inference_mode():
         z = slam.space.to_fourier(slam.map.read(slam.pointers)[0])
         strength = z.abs().square().mean(-1).sqrt().tolist()
+        whole = slam.wholeness(z).tolist()
         decoded = PositionDecoder(slam.space)(z)
         at, clear = decoded.position_m.tolist(), decoded.similarity.tolist()
+        spread = slam.uncertainty(z)
     rows = range(len(slam.names)) if cells is None else _confirmed(cells)
     found: list[Found] = []
     by_number: dict[int, Found] = {}
@@ -241,11 +263,16 @@ def contents(semantic_map: SemanticCells | SSPSLAM) -> Contents:
         if cells is not None:
             kind, number = (int(cells.known[c][row]) for c in ("kind", "number"))
             words = cells.words.words_of(kind, number)
-        if strength[row] < _LEAST_STRENGTH or clear[row] < CLEAR * strength[row]:
+        if strength[row] < _LEAST_STRENGTH or clear[row] < CLEAR * whole[row]:
             missing[name.upper()] = f"{name} is not recalled clearly, strength {strength[row]:.2f}"
             continue
         x, y = at[row]
         one = Found(name, "landmark", words, (x, y), strength=strength[row])
+        if spread is not None:
+            (xx, xy), (yx, yy) = spread.covariance_m2[row].tolist()
+            one = one._replace(
+                strength=float(spread.strength[row]), covariance_m2=((xx, xy), (yx, yy))
+            )
         found.append(one)
         if cells is not None and kind == 0:
             by_number[number] = one

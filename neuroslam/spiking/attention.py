@@ -23,12 +23,15 @@ class Sight(NamedTuple):
             ``(steps, batch, n_frequencies)``; 0 where nothing is.
         attended: Number of the landmark, ``NOTHING`` or ``SEVERAL``, ``(steps, batch)``.
         held_s: For how long it has been attended to, ``(steps, batch)``.
+        damping: Factors of its coefficients by the noise of the sensor, ``(steps, batch,
+            n_frequencies)``; ``(steps, batch, 1)`` where sightings are exact.
     """
 
     key: Tensor
     vector: Tensor
     attended: Tensor
     held_s: Tensor
+    damping: Tensor
 
 
 def attend(in_view: Tensor, distance_m: Tensor, time_s: Tensor, turn_s: float, how: str) -> Tensor:

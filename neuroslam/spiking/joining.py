@@ -127,7 +127,8 @@ def _same_kind(loaded: SSPSLAM, partial: SSPSLAM) -> None:
 def _known(slam: SSPSLAM) -> dict[str, Tensor]:
     """Return the recall of each known landmark, by name, as Fourier coefficients."""
     z = slam.space.to_fourier(slam.map.read(slam.pointers)[0])
-    strength = z.abs().square().mean(-1).sqrt()
+    found = slam.uncertainty(z)
+    strength = z.abs().square().mean(-1).sqrt() if found is None else found.strength
     return {name: z[k] / strength[k] for k, name in enumerate(slam.names) if strength[k] > _KNOWN}
 
 
@@ -142,7 +143,13 @@ def _written(
     state = partial.state_dict()
     for prefix in ("map.", "places."):
         state |= {k: v for k, v in loaded.state_dict().items() if k.startswith(prefix)}
-    merged.load_state_dict(state | {"pointers": merged.pointers})
+    state["pointers"] = merged.pointers
+    if merged.config.has_uncertain_sightings:
+        state["evidence_s"] = sum(
+            (_evidence(part, merged.names) for part in (loaded, partial)),
+            torch.zeros_like(merged.evidence_s),
+        )
+    merged.load_state_dict(state)
     keys = torch.stack([pointers[name] for name in known])
     vectors = merged.space.from_fourier(torch.stack(list(known.values())))
     merged.map.write(keys, vectors)
@@ -150,3 +157,9 @@ def _written(
         merged.places.write(vectors, keys)
     merged.start(partial.integrator.position_m + offset_m)
     return merged
+
+
+def _evidence(slam: SSPSLAM, names: tuple[str, ...]) -> Tensor:
+    """Return the evidence of a map for landmarks by name, ``(1, landmarks)``; 0 for others."""
+    known = dict(zip(slam.names, slam.evidence_s[0].tolist(), strict=True))
+    return slam.evidence_s.new_tensor([[known.get(name, 0.0) for name in names]])

@@ -15,6 +15,7 @@ from neuroslam.geometry import wrap_angle
 from neuroslam.sensors.landmarks import KINDS, LandmarkWords
 from neuroslam.sensors.markers import MarkerDetector
 from neuroslam.spiking.decoding import PositionDecoder
+from neuroslam.spiking.gaussian import encode_gaussian
 from neuroslam.spiking.landmark_frames import from_frame, into_frame, shared_frames
 from neuroslam.spiking.landmark_matching import match_landmarks
 from neuroslam.spiking.semantic_joining import merge_landmarks
@@ -296,7 +297,8 @@ class SemanticCells(Population):
     def tables(self) -> dict[str, str]:
         """Return ``landmarks.csv``: name,x_m,y_m,seen,first_frame,experience.
 
-        A vocabulary with words adds the column ``words``.
+        A vocabulary with words adds the column ``words``, uncertain sightings the covariance of the
+        position: ``var_x_m2,cov_xy_m2,var_y_m2``.
         """
         known = self.landmarks()
         columns = ("name", "place_m", "seen", "first_frame", "experience", "words")
@@ -306,6 +308,14 @@ class SemanticCells(Population):
         if self.words.entries:
             header += ",words"
             lines = [f"{line},{row[-1]}" for line, row in zip(lines, rows, strict=True)]
+        spread = self.covariances()
+        if spread is not None:
+            header += ",var_x_m2,cov_xy_m2,var_y_m2"
+            each = spread[self.known.confirmed().numpy()]
+            lines = [
+                f"{line},{xx!r},{xy!r},{yy!r}"
+                for line, ((xx, xy), (_, yy)) in zip(lines, each.tolist(), strict=True)
+            ]
         return {"landmarks.csv": "\n".join([header, *lines, ""])}
 
     def points_m(self) -> np.ndarray:
@@ -420,14 +430,38 @@ class SemanticCells(Population):
         there = from_frame(poses[anchor[rows]], self.known["offset_m"].numpy()[rows])
         if np.abs(there - place[rows]).max() < _MOVED_M:
             return False
+        certain = self.covariances()
         self.known["place_m"][rows] = torch.from_numpy(there)
-        self.write_memory()
+        self.write_memory(certain)
         return True
 
-    def write_memory(self) -> None:
-        """Rewrite the memory so that every landmark recalls its position in ``known``."""
+    def covariances(self) -> np.ndarray | None:
+        """Return the covariances of the recalled positions; see :meth:`SSPSLAM.uncertainty`.
+
+        Returns:
+            In square metres, ``(n, 2, 2)``, 0 where the recall is weak; ``None`` if sightings are
+            exact.
+        """
+        z = self.slam.space.to_fourier(self.slam.map.read(self.slam.pointers)[0])
+        found = self.slam.uncertainty(z[: len(self.known)])
+        if found is None:
+            return None
+        known = (found.strength > _KNOWN)[:, None, None]
+        return torch.where(known, found.covariance_m2, 0.0).double().numpy(force=True)
+
+    def write_memory(self, covariance_m2: np.ndarray | None = None) -> None:
+        """Rewrite the memory so that every landmark recalls its position in ``known``.
+
+        Args:
+            covariance_m2: Of the positions, ``(n, 2, 2)``; ``None``: they are exact.
+        """
         slam = self.slam
-        places = slam.space.encode(self.known["place_m"].to(slam.pointers)).detach()
+        at = self.known["place_m"].to(slam.pointers)
+        if covariance_m2 is None:
+            places = slam.space.encode(at).detach()
+        else:
+            spread = torch.from_numpy(covariance_m2).to(at)
+            places = slam.space.from_fourier(encode_gaussian(slam.space, at, spread)).detach()
         slam.map.write(slam.pointers, places)
         if slam.places is not None:
             slam.places.write(places, slam.pointers)
@@ -551,7 +585,7 @@ class SemanticCells(Population):
         recalled = torch.view_as_complex(self.slam.recalled)
         start = self.known["place_m"][row][None].to(recalled.real)
         place = self.decoder.track(recalled, start)
-        clear = CLEAR * float(recalled.abs().square().mean(-1).sqrt())
+        clear = CLEAR * float(self.slam.wholeness(recalled))
         if float(self.decoder.similarity(recalled, place)) < clear:  # decoded at a side lobe?
             again = torch.from_numpy(seen_m)[None].to(start)
             for _ in range(_STEPS):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from neuroslam.config.semantic import SemanticConfig
-from neuroslam.geometry import rotate_points, wrap_angle
+from neuroslam.geometry import rotate_points, rotation_matrix, wrap_angle
 from neuroslam.spiking.sightings import LEAST_SEEN, NAMELESS, VIEW
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.spiking.vocabulary import SemanticState, Vocabulary, WordTable, landmark_pointer
@@ -35,7 +35,11 @@ class LandmarkCells(Protocol):
         """Move positions of the partial session into the loaded frame."""
         ...
 
-    def write_memory(self) -> None:
+    def covariances(self) -> np.ndarray | None:
+        """Return the covariances of the recalled positions; ``None`` if they are exact."""
+        ...
+
+    def write_memory(self, covariance_m2: np.ndarray | None = None) -> None:
         """Rewrite the memory from ``known``."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> object:
@@ -69,6 +73,8 @@ def merge_landmarks(
     keys = {key: row for row, key in enumerate(one.known.row_of)}
     columns: dict[str, list[Any]] = {c: one.known[c].tolist() for c in one.known.columns}
     free = sum(kind == NAMELESS for kind, _ in keys)
+    ours, added = _spreads(one, other, join)
+    evidence, more = _evidence(one), _evidence(other)
     for row, (kind, number) in enumerate(other.known.row_of):
         if kind == VIEW:
             number = int(join.views[number])
@@ -84,22 +90,57 @@ def merge_landmarks(
             keys[kind, number] = len(columns["kind"])
             for c, value in (theirs | {"number": number, "place_m": there[row].tolist()}).items():
                 columns[c].append(value)
+            ours.append(added[row])
+            evidence.append(more[row])
             continue
         mine = np.array(columns["place_m"][at])
         agree = np.linalg.norm(mine - there[row]) < one.config.same_m
         if agree:
             columns["place_m"][at] = ((mine + there[row]) / 2).tolist()
+            ours[at] = (ours[at] + added[row]) / 2 + np.outer(*[mine - there[row]] * 2) / 4
         elif theirs["seen"] >= LEAST_SEEN or columns["seen"][at] < LEAST_SEEN:
             columns["place_m"][at] = there[row].tolist()
+            ours[at] = added[row]
+        evidence[at] += more[row]
         columns["seen"][at] += theirs["seen"]
         columns["variance_m2"][at] = min(columns["variance_m2"][at], theirs["variance_m2"])
     for cells in (one, other):
         merged.words.update(cells.words.entries)
-    return _written(merged, other, columns, join)
+    certainty = (np.array(ours), evidence) if one.config.has_uncertain_sightings else None
+    return _written(merged, other, columns, certainty, join)
+
+
+def _spreads(
+    one: LandmarkCells, other: LandmarkCells, join: Join
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the covariances of both sessions' landmarks in the loaded frame; 0 if exact."""
+    each = []
+    for cells in (one, other):
+        spread = cells.covariances()
+        each.append(np.zeros((len(cells.known), 2, 2)) if spread is None else spread)
+    turn = rotation_matrix(_turn(other, join))
+    return list(each[0]), list(turn @ each[1] @ turn.T)
+
+
+def _evidence(cells: LandmarkCells) -> list[float]:
+    """Return the time for which each landmark was learnt, by its certainty; 0 if exact."""
+    n = len(cells.known)
+    return (
+        cells.slam.evidence_s[0, :n].tolist() if cells.config.has_uncertain_sightings else [0] * n
+    )
+
+
+def _turn(session: LandmarkCells, join: Join) -> float:
+    """Return by how much a partial session's positions turn."""
+    return join.rotation_rad if session.follows == "map" else join.cells_turn_rad
 
 
 def _written(
-    merged: LandmarkCells, session: LandmarkCells, columns: dict[str, list[Any]], join: Join
+    merged: LandmarkCells,
+    session: LandmarkCells,
+    columns: dict[str, list[Any]],
+    certainty: tuple[np.ndarray, list[float]] | None,
+    join: Join,
 ) -> State:
     """Write landmarks into new cells, which continue the partial session; return their state."""
     dtypes = {c: session.known[c].dtype for c in columns}
@@ -115,14 +156,18 @@ def _written(
         )
         names = [merged.words.name_of(*key) for key in merged.known.row_of]
         slam.know(pointers.to(slam.pointers), names)
-        merged.write_memory()
+        if certainty is None:
+            merged.write_memory()
+        else:
+            spread, evidence = certainty
+            merged.write_memory(spread)
+            slam.evidence_s = slam.evidence_s.new_tensor([evidence])
     now = session.moved(np.array([session.pose[:2]]), join)[0]
     slam.time_s = session.slam.time_s.clone()
     slam.start(torch.tensor(now[None]))
     for name in session.now.kinds:
         setattr(merged.now, name, getattr(session.now, name))
-    turn = join.rotation_rad if session.follows == "map" else join.cells_turn_rad
-    merged.now.heading_rad = wrap_angle(session.now.heading_rad + turn)
+    merged.now.heading_rad = wrap_angle(session.now.heading_rad + _turn(session, join))
     merged.now.told = -1
     return merged.state_dict()
 

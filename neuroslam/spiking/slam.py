@@ -17,6 +17,12 @@ from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.correction import SpikingCorrection
 from neuroslam.spiking.ensemble import filtered, lowpass, replace, synapse, view
+from neuroslam.spiking.gaussian import (
+    Gaussian,
+    fit_gaussian,
+    gaussian_damping,
+    sighting_covariance,
+)
 from neuroslam.spiking.path_integrator import REREAD_STEPS, PathIntegrator
 from neuroslam.spiking.populations import TAU_S as TAU_VECTOR_S
 from neuroslam.spiking.populations import VectorPopulation
@@ -79,6 +85,13 @@ class SSPSLAM(BufferModule):
     the path integrator, if the gate :math:`g` finds that both agree. If a known landmark
     contradicts for ``relocalise_after_s``, the animal was lost and relocalises by it.
 
+    Where sightings have a standard deviation (``sigma_distance_m``, ``sigma_bearing_rad``), the
+    learnt vector is its expectation over the noise, :math:`E[\phi(x_i + \epsilon)]`, each
+    coefficient damped by :func:`~neuroslam.spiking.gaussian.gaussian_damping`; so the memory holds
+    how certain the position is, and coefficients correct the more the more certain they are. It
+    learns the mean of all sightings, each weighted by its certainty (``evidence_s``), until that
+    is as slow as ``map.least_plasticity``.
+
     All tiers have the same parts; see their classes for the equations. Velocities and vectors to
     landmarks are allocentric (rotated by a compass).
 
@@ -106,6 +119,7 @@ class SSPSLAM(BufferModule):
     pull: Tensor
     here: Tensor
     there: Tensor
+    evidence_s: Tensor
 
     def __init__(
         self,
@@ -172,6 +186,8 @@ class SSPSLAM(BufferModule):
         self.register_buffer("held_s", torch.zeros(batch))
         self.register_buffer("familiar", torch.zeros(batch, dtype=torch.bool))
         self.register_buffer("contradicted_s", torch.zeros(batch))
+        if c.has_uncertain_sightings:
+            self.register_buffer("evidence_s", torch.zeros(batch, len(pointers)))
         for name in ("recalled", "pull", "here", "there"):
             self.register_buffer(name, torch.zeros(batch, self.space.n_frequencies, 2))
 
@@ -198,6 +214,10 @@ class SSPSLAM(BufferModule):
                 f"SSPSLAM: pointers of shape {tuple(pointers.shape)}, expected (landmarks, {n_key})"
             )
         names = _checked_names(names, len(pointers))
+        if self.config.has_uncertain_sightings:
+            new = pointers.to(self.pointers)
+            same = (new.unsqueeze(1) == self.pointers).all(-1)
+            self.evidence_s = self.evidence_s @ same.T.to(self.evidence_s)
         self.pointers = pointers.to(self.pointers)
         self._names = names
 
@@ -289,7 +309,7 @@ class SSPSLAM(BufferModule):
 
     def _runs_compiled(self, *inputs: Tensor) -> bool:
         """Return whether compiled steps may take these inputs and the state."""
-        if self.correction is not None:
+        if self.correction is not None or self.config.has_uncertain_sightings:
             return False
         space, walk = self.space, self.integrator
         tensors = (
@@ -473,9 +493,16 @@ class SSPSLAM(BufferModule):
         return late
 
     def _step(
-        self, velocity: Tensor, key: Tensor, vector: Tensor, attended: Tensor, held_s: Tensor
+        self,
+        velocity: Tensor,
+        key: Tensor,
+        vector: Tensor,
+        attended: Tensor,
+        held_s: Tensor,
+        damping: Tensor,
     ) -> SSPStep:
         c, space = self.config, self.space
+        uncertain = c.has_uncertain_sightings
         seen = (attended != NOTHING).to(key)
         # Neurons need a while to represent a landmark; vectors one step, and one to be compared.
         settled = held_s > (1.5 * c.time_step_s if c.tier == "algebraic" else _SETTLED_S)
@@ -489,11 +516,16 @@ class SSPSLAM(BufferModule):
             here = self._late("here", here, TAU_VECTOR_S)
         place = here * vector if self.binding is None else self.binding(here, vector)
         strength = torch.view_as_complex(self.recalled).abs().square().mean(-1).sqrt()
+        if uncertain:  # relative to what a sighting as certain as this one leaves
+            place = place * damping
+            strength = strength / damping.square().mean(-1).sqrt()
         lost = self._is_lost()
         # No learning while landmarks contradict: the map must not adapt to a wrong position.
         doubts = (self.contradicted_s > 0) & (c.relocalise_after_s > 0)
         learns = seen if c.quantised else (settled & ~doubts).to(key)
         plasticity = learns * self._plasticity(strength)
+        if uncertain:
+            plasticity = self._averaging(attended, learns, damping)
         place = space.from_fourier(place)
         recall = space.to_fourier(self.map(key, place, seen, plasticity))
         if self.places is not None:
@@ -504,6 +536,8 @@ class SSPSLAM(BufferModule):
             implied = self.unbinding(recall, vector.conj())
             here = self._late("there", here, TAU_BINDING_S)
         agreement = (implied.real * here.real + implied.imag * here.imag).mean(-1)
+        if uncertain:
+            agreement = agreement / damping.mean(-1)
         # What is learnt in the present visit is no more accurate than the position.
         familiar = torch.where(settled, self.familiar, strength > KNOWN)
         known = familiar & settled & (seen > 0)
@@ -512,6 +546,9 @@ class SSPSLAM(BufferModule):
         unit = implied / implied.abs().square().mean(-1, keepdim=True).sqrt().clamp_min(1e-3)
         gain = torch.where(lost & known, _LOST_GAIN, self.gain * gate)
         apart = unit - here
+        if uncertain:
+            certain = implied.abs() / strength.clamp_min(KNOWN).unsqueeze(-1)
+            apart = certain * (implied / implied.abs().clamp_min(1e-6) - here)
         if self.correction is not None:
             gain, apart = self.gain.expand(self.batch), self.correction(implied, here, seen)
             gate = 1.0 - self.correction.veto.clamp(0.0, 1.0)
@@ -548,6 +585,27 @@ class SSPSLAM(BufferModule):
             return torch.ones_like(strength)
         return (1.0 - strength.square()).clamp(c.least_plasticity, 1.0)
 
+    def _averaging(self, attended: Tensor, learns: Tensor, damping: Tensor) -> Tensor:
+        r"""Add a sighting to the evidence, and return the plasticity by which a mean is learnt.
+
+        .. math:: w = \text{mean}_k\, d_k^2, \qquad t \leftarrow t + w\,\Delta t, \qquad
+                  p = w / (\kappa\, t)
+
+        with the damping :math:`d` and the rate of learning :math:`\kappa`; each sighting has the
+        weight :math:`w` in the mean.
+        """
+        c = self.config.map
+        weight = learns * damping.square().mean(-1)
+        row = attended.clamp_min(0).unsqueeze(-1)
+        more = torch.zeros_like(self.evidence_s)
+        more.scatter_(-1, row, (weight * self.config.time_step_s).unsqueeze(-1))
+        self.evidence_s = (self.evidence_s + more).detach()
+        if c.plasticity == "constant":
+            return learns
+        seen_s = self.evidence_s.gather(-1, row).squeeze(-1)
+        share = weight / (c.learning_rate_s * seen_s.clamp_min(1e-9))
+        return learns * share.clamp(c.least_plasticity, 1.0)
+
     def _is_lost(self) -> Tensor:
         after = self.config.relocalise_after_s
         if after == 0:
@@ -580,13 +638,14 @@ class SSPSLAM(BufferModule):
             z = torch.zeros(steps, self.batch, self.space.n_frequencies, 2).to(kind)
             attended = torch.full((steps, self.batch), NOTHING, device=kind.device)
             vector = torch.view_as_complex(z)
+            damping = kind.new_ones(steps, self.batch, 1)
         else:
-            key, vector, attended = self._seen(view, steps)
+            key, vector, attended, damping = self._seen(view, steps)
         held_s = held(attended, self.attended, self.held_s, self.config.time_step_s)
-        return velocity, Sight(key, vector, attended, held_s)
+        return velocity, Sight(key, vector, attended, held_s, damping)
 
-    def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return pointers and vectors of what is attended to, and the attended landmarks."""
+    def _seen(self, view: LandmarkView, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return pointers and vectors of what is attended to, its number, and its damping."""
         c, kind, n = self.config, self.pointers, len(self.pointers)
         in_view = torch.as_tensor(np.asarray(view.in_view), device=kind.device)
         if in_view.shape != (steps, self.batch, n):
@@ -613,14 +672,50 @@ class SSPSLAM(BufferModule):
             key = in_view.to(kind) @ kind
             vector = (z * in_view.unsqueeze(-1)).sum(-2)
             several = torch.where(in_view.sum(-1) > 1, SEVERAL, in_view.to(torch.uint8).argmax(-1))
-            return key, vector, torch.where(in_view.any(-1), several, NOTHING)
+            exact = kind.new_ones(steps, self.batch, 1)
+            return key, vector, torch.where(in_view.any(-1), several, NOTHING), exact
         time = self.time_s + c.time_step_s * torch.arange(steps, dtype=torch.float64)
         attended = attend(in_view, distance, time, c.turn_s, c.attention)
         some, which = attended != NOTHING, attended.clamp_min(0)
         mine = boxes[which].unsqueeze(-1).expand(-1, -1, -1, low.shape[-1])
-        z = region_vectors(self.space, low.gather(2, mine), high.gather(2, mine), weight[which])
+        low, high, weight = low.gather(2, mine), high.gather(2, mine), weight[which]
+        z = region_vectors(self.space, low, high, weight)
         some = some.unsqueeze(-1)
-        return kind[which] * some, z * some, attended
+        return kind[which] * some, z * some, attended, self._damping(low, high, weight, some)
+
+    def _damping(self, low_m: Tensor, high_m: Tensor, weight: Tensor, some: Tensor) -> Tensor:
+        """Return the factors of coefficients by the noise of sightings; 1 where nothing is seen."""
+        c = self.config
+        if not c.has_uncertain_sightings:
+            return weight.new_ones(()).expand(*some.shape)
+        middle = ((low_m + high_m) / 2.0 * weight.unsqueeze(-1)).sum(-2)
+        middle = torch.where(some, middle, 0.0)
+        covariance = sighting_covariance(middle, c.sigma_distance_m, c.sigma_bearing_rad)
+        return gaussian_damping(self.space, covariance)
+
+    def wholeness(self, z: Tensor) -> Tensor:
+        """Return the similarity with its position of a recall that is of one position alone.
+
+        Args:
+            z: Recall as Fourier coefficients, complex, ``(..., n_frequencies)``.
+        """
+        if self.config.has_uncertain_sightings:  # their coefficients are not of one modulus
+            return z.abs().mean(-1)
+        return z.abs().square().mean(-1).sqrt()
+
+    @torch.no_grad()
+    def uncertainty(self, z: Tensor) -> Gaussian | None:
+        """Return the normal distributions that recalls hold; ``None`` if sightings are exact.
+
+        The covariance is that of one sighting as remembered: the noise declared for the sensor, and
+        the scatter of the sightings. The mean of many is better known.
+
+        Args:
+            z: Recall as Fourier coefficients, complex, ``(..., n_frequencies)``.
+        """
+        if not self.config.has_uncertain_sightings:
+            return None
+        return fit_gaussian(self.space, z, free_strength=True)
 
     def _positions(self, position_m: Tensor) -> Tensor:
         """Check positions against the space."""

@@ -42,8 +42,7 @@ class GrowingTable(nn.Module):
 
     def append(self, **row: float | Tensor) -> int:
         """Add one row, a value for every column, and return its number."""
-        if self.n == self._column(self.columns[0]).shape[0]:
-            self.reserve(max(16, 2 * self.n))
+        self._make_room()
         for name in self.columns:
             column, value = self._column(name), row[name]
             if column.device.type == "cpu":
@@ -52,6 +51,28 @@ class GrowingTable(nn.Module):
                 column[self.n] = value
         self.n += 1
         return self.n - 1
+
+    def append_empty(self) -> int:
+        """Add one row for the caller to write, into :meth:`storage`, and return its number."""
+        self._make_room()
+        self.n += 1
+        return self.n - 1
+
+    def storage(self) -> dict[str, Tensor]:
+        """Return every column with its spare rows.
+
+        Example:
+            >>> table = GrowingTable({"x_m": ((), torch.float64)})
+            >>> row = table.append_empty()
+            >>> table.storage()["x_m"][row] = 0.5
+            >>> table["x_m"].tolist()
+            [0.5]
+        """
+        return cast(dict[str, Tensor], dict(self._buffers))
+
+    def _make_room(self) -> None:
+        if self.n == self._column(self.columns[0]).shape[0]:
+            self.reserve(max(16, 2 * self.n))
 
     def reserve(self, capacity: int) -> None:
         """Make room for ``capacity`` rows; the rows in use stay."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from neuroslam.compiled import compiled, plain_array, runs_compiled
 from neuroslam.config import ViewConfig
 from neuroslam.config.sections import region_in
 from neuroslam.errors import ConfigError
@@ -45,8 +46,20 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
         [4.5, 6.5, 8.5, 10.5]
     """
     check_image(image, "LocalViewCells")
-    image = to_grey(image, config.grey)
-    view = block_mean(crop(image, config.crop), config.template_height, config.template_width)
+    image = crop(to_grey(image, config.grey), config.crop)
+    height, width = config.template_height, config.template_width
+    if runs_compiled():
+        view, contrast = encode_step(
+            plain_array(image),
+            height,
+            width,
+            *_block_of(image, height, width),
+            config.normalisation,
+            config.patch_radius,
+            config.patch_min_std,
+        )
+        return Encoded(view, contrast if config.min_contrast else 1.0)
+    view = block_mean(image, height, width)
     contrast = float(view.std()) if config.min_contrast else 1.0
     if config.normalisation:
         view = normalise_mean(view, config.normalisation)
@@ -81,6 +94,16 @@ def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
     Raises:
         ConfigError: If the image is smaller than the result.
     """
+    block_h, block_w = _block_of(image, height, width)
+    blocks = image[: height * block_h, : width * block_w].reshape(height, block_h, -1)
+    rows = np.add.reduce(blocks, axis=1, dtype=np.uint32)
+    sums = rows[:, ::block_w].copy()  # adding columns is faster than reducing a short axis
+    for column in range(1, block_w):
+        sums += rows[:, column::block_w]
+    return np.asarray(sums / (255.0 * block_h * block_w))
+
+
+def _block_of(image: np.ndarray, height: int, width: int) -> tuple[int, int]:
     h, w = image.shape
     block_h, block_w = h // height, w // width
     if not block_h or not block_w:
@@ -88,12 +111,7 @@ def block_mean(image: np.ndarray, height: int, width: int) -> np.ndarray:
             f"view.template_width x template_height = {width}x{height} is larger than the "
             f"cropped image of {w}x{h} px; make the template smaller or the crop larger"
         )
-    blocks = image[: height * block_h, : width * block_w].reshape(height, block_h, -1)
-    rows = np.add.reduce(blocks, axis=1, dtype=np.uint32)
-    sums = rows[:, ::block_w].copy()  # adding columns is faster than reducing a short axis
-    for column in range(1, block_w):
-        sums += rows[:, column::block_w]
-    return np.asarray(sums / (255.0 * block_h * block_w))
+    return block_h, block_w
 
 
 def normalise_mean(view: np.ndarray, mean: float) -> np.ndarray:
@@ -140,3 +158,141 @@ def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:
 def _patch_weights(shape: tuple[int, int], radius: int) -> np.ndarray:
     """Return one over the number of pixels of each patch that lie in the view."""
     return 1.0 / _patch_sums(np.ones(shape), radius)
+
+
+@compiled
+def encode_step(
+    image: np.ndarray,
+    height: int,
+    width: int,
+    block_h: int,
+    block_w: int,
+    mean: float,
+    radius: int,
+    min_std: float,
+) -> tuple[np.ndarray, float]:
+    """Make the template of a cropped grey image, as :func:`encode` does.
+
+    Args:
+        image: ``uint8``, ``(h, w)``.
+        height: Rows of the template.
+        width: Columns of the template.
+        block_h: Rows of the image that become one.
+        block_w: Columns of the image that become one.
+        mean: Grey to which the mean is scaled; 0: no scaling.
+        radius: Half width of a patch in px; 0: no patches.
+        min_std: See :func:`normalise_patches`.
+
+    Returns:
+        Template, ``(height, width)``, and contrast.
+    """
+    view = np.empty(height * width)
+    sums = np.empty(width * block_w, np.uint32)
+    for row in range(height):
+        for x in range(width * block_w):
+            sums[x] = 0
+        for y in range(row * block_h, (row + 1) * block_h):
+            for x in range(width * block_w):
+                sums[x] += image[y, x]
+        for column in range(width):
+            total = 0
+            for x in range(column * block_w, (column + 1) * block_w):
+                total += np.int64(sums[x])
+            view[row * width + column] = total / (255.0 * block_h * block_w)
+    present = _sum(view) / (height * width)
+    squares = np.empty(height * width)
+    for i in range(height * width):
+        squares[i] = (view[i] - present) * (view[i] - present)
+    contrast = np.sqrt(_sum(squares) / (height * width))
+    if mean > 0.0 and present > 0.0:
+        for i in range(height * width):
+            view[i] = min(view[i] * mean / present, 1.0)
+        present = _sum(view) / (height * width)
+    found = view.reshape(height, width)
+    if radius > 0:
+        _normalise_patches(found, present, radius, max(min_std, 1e-6))
+    return found, contrast
+
+
+@compiled
+def _sum(values: np.ndarray) -> float:
+    """Add numbers in the order in which numpy adds them, so that means are equal to the last bit.
+
+    Parts of at most 128 numbers are added in eight sums; longer ones are halved, at a multiple of
+    eight, and their sums added.
+    """
+    eight, total, depth = np.empty(8), 0.0, 0
+    starts, sizes = np.zeros(64, np.int64), np.zeros(64, np.int64)  # of parts in each other
+    halved, half_sums = np.zeros(64, np.int64), np.zeros(64)  # whether a first half is added
+    sizes[0] = values.shape[0]
+    while depth >= 0:
+        start, n = starts[depth], sizes[depth]
+        if n > 128:
+            depth += 1
+            starts[depth], sizes[depth], halved[depth] = start, n // 16 * 8, 0
+            continue
+        total, whole = 0.0, n // 8 * 8
+        if n >= 8:
+            for k in range(8):
+                eight[k] = values[start + k]
+            for first in range(start + 8, start + whole, 8):
+                for k in range(8):
+                    eight[k] += values[first + k]
+            total = ((eight[0] + eight[1]) + (eight[2] + eight[3])) + (
+                (eight[4] + eight[5]) + (eight[6] + eight[7])
+            )
+        for k in range(start + whole, start + n):
+            total += values[k]
+        depth -= 1
+        while depth >= 0 and halved[depth] == 1:
+            total = half_sums[depth] + total
+            depth -= 1
+        if depth >= 0:  # the second half of this part
+            half_sums[depth], halved[depth] = total, 1
+            half = sizes[depth] // 16 * 8
+            depth += 1
+            starts[depth], halved[depth] = starts[depth - 1] + half, 0
+            sizes[depth] = sizes[depth - 1] - half
+    return total
+
+
+@compiled
+def _normalise_patches(view: np.ndarray, present: float, radius: int, flat: float) -> None:
+    """Normalise a view of mean ``present`` in place; sums run on as in OpenCV's box filter."""
+    height, width = view.shape
+    sums, squares = np.zeros((height, width)), np.zeros((height, width))
+    for row in range(height):  # sums over the columns of the patches
+        sum_ = square = 0.0
+        for column in range(-radius, width):
+            new = old = 0.0
+            if column + radius < width:
+                new = view[row, column + radius] - present
+            if column > radius:
+                old = view[row, column - radius - 1] - present
+            sum_ += new - old
+            square += new * new - old * old
+            if column >= 0:
+                sums[row, column], squares[row, column] = sum_, square
+    sum_of, square_of = np.zeros(width), np.zeros(width)
+    for row in range(-radius, height):
+        if row > radius:
+            for column in range(width):
+                sum_of[column] -= sums[row - radius - 1, column]
+                square_of[column] -= squares[row - radius - 1, column]
+        if row + radius < height:
+            for column in range(width):
+                sum_of[column] += sums[row + radius, column]
+                square_of[column] += squares[row + radius, column]
+        if row < 0:
+            continue
+        rows = min(row + radius + 1, height) - max(row - radius, 0)
+        for column in range(width):
+            columns = min(column + radius + 1, width) - max(column - radius, 0)
+            weight = 1.0 / (rows * columns)
+            mean = sum_of[column] * weight
+            std = np.sqrt(max(square_of[column] * weight - mean * mean, 0.0))
+            if std <= flat:
+                view[row, column] = 0.5
+            else:
+                level = (view[row, column] - present - mean) / (6.0 * std) + 0.5
+                view[row, column] = min(max(level, 0.0), 1.0)

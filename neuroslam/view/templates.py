@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroslam.compiled import plain_array, runs_compiled
 from neuroslam.config import ViewConfig
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
@@ -16,16 +17,23 @@ from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
 from neuroslam.view.preprocess import Encoded
 from neuroslam.view.search import (
+    Coarse,
     Geometry,
     Nearest,
     distances,
     find_nearest,
+    learn_step,
+    limit_of,
     near_pairs,
+    nearest_step,
+    plan_of,
     template_blocks,
 )
 
 GATE_MARGIN = 0.005
 """Added to the threshold when templates are skipped by their mean, as in OpenRatSLAM."""
+
+_NO_VALUES, _NO_MEANS = np.empty((0, 0)), np.empty(0)
 
 _BATCH = 1024  # comparisons in full precision at a time: a few megabytes
 
@@ -82,6 +90,7 @@ class LocalViewCells(Mergeable):
         if config.mean_gate:
             columns["mean"] = ((), torch.float64)
         self.templates = GrowingTable(columns)
+        self._coarse = Coarse()
         self.last = _Last(template=NO_TEMPLATE)
         if config.features != "grey":
             self.network = _Network(digest=0)
@@ -186,6 +195,9 @@ class LocalViewCells(Mergeable):
             MapError: If the view does not have the size of the templates.
         """
         self._check(view)
+        columns = self._arrays()
+        if columns is not None:
+            return self._search_compiled(view, limit, columns)
         query = to_bytes(view.T)
         if self._exact or self.config.mean_gate:
             found, error = self._search_values(np.ascontiguousarray(view.T), query)
@@ -254,6 +266,10 @@ class LocalViewCells(Mergeable):
             MapError: If the view does not have the size of the templates.
         """
         self._check(view)
+        if isinstance(self.encoder, FeatureEncoder):
+            self.network.digest = self.encoder.digest
+        if runs_compiled(*self.templates.storage().values()):
+            return self._learn_compiled(view)
         columns = np.ascontiguousarray(view.T)
         pixels = to_bytes(columns)
         row: dict[str, float | Tensor] = {
@@ -264,9 +280,25 @@ class LocalViewCells(Mergeable):
             row["values"] = torch.from_numpy(columns.reshape(-1))
         if self.config.mean_gate:
             row["mean"] = float(view.mean() if self._exact else pixels.mean() / 255.0)
-        if isinstance(self.encoder, FeatureEncoder):
-            self.network.digest = self.encoder.digest
         return self.templates.append(**row)
+
+    def _learn_compiled(self, view: np.ndarray) -> int:
+        """Learn as :meth:`learn` does, in one compiled step."""
+        template, plan = self.templates.append_empty(), plan_of(self.geometry)
+        columns = self._arrays()
+        assert columns is not None
+        level = learn_step(
+            plain_array(view),
+            template,
+            columns["pixels"],
+            columns["blocks"],
+            columns["values"],
+            self.geometry.core[0],
+            plan.sizes[3:7],
+        )
+        if self.config.mean_gate:
+            columns["mean"][template] = view.mean() if self._exact else level / 255.0
+        return template
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Append the partial session's unmatched templates to the loaded ones (Eq. 9)."""
@@ -286,6 +318,42 @@ class LocalViewCells(Mergeable):
                 f"LocalViewCells: view is {view.shape}; expected (template_height, template_width) "
                 f"= {size}, the result of encode"
             )
+
+    def _arrays(self) -> dict[str, np.ndarray] | None:
+        """Return the columns of the templates for compiled steps, or ``None`` if none may run."""
+        storage = self.templates.storage()
+        if not runs_compiled(*storage.values()):
+            return None
+        found = {name: column.numpy() for name, column in storage.items()}
+        found.setdefault("values", _NO_VALUES)
+        found.setdefault("mean", _NO_MEANS)
+        return found
+
+    def _search_compiled(
+        self, view: np.ndarray, limit: float, columns: dict[str, np.ndarray]
+    ) -> ViewMatch:
+        """Search as :meth:`search` does, in one compiled step."""
+        n, config, geometry = self.n, self.config, self.geometry
+        scale = 255.0 * geometry.n_pixels
+        if self._exact or config.mean_gate:
+            limit = np.inf
+        found, distance, shift = nearest_step(
+            plain_array(view),
+            columns["pixels"],
+            columns["blocks"],
+            columns["values"],
+            columns["mean"],
+            self._coarse.of(self.templates.storage()["pixels"], n, geometry),
+            n,
+            *plan_of(geometry),
+            config.threshold + GATE_MARGIN,
+            limit_of(n, limit * scale + 0.5),  # sums are integers: 0.5 keeps those at the limit
+            self.last.template,
+        )
+        if found == NO_TEMPLATE:
+            return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+        heading = self._relative_heading(geometry.offsets[shift])
+        return ViewMatch(found, distance / scale, heading, False)
 
     def _search_values(self, view: np.ndarray, query: np.ndarray) -> tuple[Nearest, float]:
         """Search in full precision; the bytes select the templates and shifts to compare.

@@ -121,6 +121,52 @@ def read_path(path: str | Path, time_step_s: float = 1e-3, reach_m: float = 0.9)
     return _into_box(times, table, time_step_s, reach_m, str(path))
 
 
+KITTI_SEQUENCES = tuple(f"{number:02d}" for number in range(11))
+"""KITTI odometry sequences whose true poses are published; those of 11 to 21 are not."""
+
+
+def kitti_files(folder: str | Path, sequence: str = "00") -> tuple[Path, Path]:
+    """Find the files of true poses and of times of a KITTI odometry sequence.
+
+    Args:
+        folder: With ``poses/00.txt`` and ``sequences/00/times.txt``, as KITTI's archives unpack, or
+            with ``KITTI_00_gt.txt`` and ``KITTI_00_gt_times.txt``.
+        sequence: Number of the sequence, of two digits.
+
+    Raises:
+        SourceError: If KITTI publishes no poses of the sequence, or there are no such files.
+
+    Example:
+        >>> kitti_files(".", "11")
+        Traceback (most recent call last):
+        neuroslam.errors.SourceError: KITTI sequence '11': its true poses are not published; \
+expected one of 00, 01, 02, 03, 04, 05, 06, 07, 08, 09, 10
+    """
+    if sequence not in KITTI_SEQUENCES:
+        raise SourceError(
+            f"KITTI sequence {sequence!r}: its true poses are not published; expected one of "
+            f"{', '.join(KITTI_SEQUENCES)}"
+        )
+    folder = Path(folder)
+    pairs = (
+        (f"KITTI_{sequence}_gt.txt", f"KITTI_{sequence}_gt_times.txt"),
+        (f"poses/{sequence}.txt", f"sequences/{sequence}/times.txt"),
+    )
+    found = [(folder / poses, folder / times) for poses, times in pairs]
+    for poses, times in found:
+        if poses.is_file() and times.is_file():
+            return poses, times
+    for poses, times in found:
+        if poses.is_file():
+            raise SourceError(
+                f"{times}: no such file; KITTI's times are in its archive of calibration files"
+            )
+    raise SourceError(
+        f"{folder}: has no poses of KITTI sequence {sequence}; expected {pairs[0][0]} or "
+        f"{pairs[1][0]}, from KITTI's archive of ground truth poses"
+    )
+
+
 def read_kitti(
     folder: str | Path, sequence: str = "00", time_step_s: float = 1e-3, reach_m: float = 0.9
 ) -> LandmarkPath:
@@ -129,7 +175,7 @@ def read_kitti(
     The camera's axes (x right, y down, z ahead) are converted to x right, y ahead, z up.
 
     Args:
-        folder: Folder of ``KITTI_00_gt.txt`` and ``KITTI_00_gt_times.txt``, or other sequences.
+        folder: As for :func:`kitti_files`.
         sequence: Number of the sequence.
         time_step_s: Time step of the path.
         reach_m: Half the longest side after scaling, all axes by one factor.
@@ -137,9 +183,7 @@ def read_kitti(
     Raises:
         SourceError: If a file is missing or has other columns.
     """
-    poses, times = (
-        _table(Path(folder) / f"KITTI_{sequence}_gt{end}.txt") for end in ("", "_times")
-    )
+    poses, times = (_table(file) for file in kitti_files(folder, sequence))
     if poses.shape[1] != 12 or times.shape[1] != 1 or len(poses) != len(times):
         raise SourceError(
             f"{folder}: poses have shape {poses.shape}, times {times.shape}; expected (n, 12) and "

@@ -1,4 +1,4 @@
-"""Cases of the compiled steps of ``spiking/``."""
+"""SSP-SLAM."""
 
 import copy
 import functools

@@ -1,7 +1,9 @@
 """Experiments of SSP-SLAM run, small, and their figures are there."""
 
 import json
+from functools import partial
 
+import numpy as np
 import pytest
 
 from neuroslam.experiments import run_experiment
@@ -59,6 +61,32 @@ def test_kitti_is_dead_reckoned_in_floating_point_and_quantised(shared, tmp_path
     ]  # fmt: skip
     assert found["metres_per_unit"] > 200
     assert pictures(tmp_path) == {"reckoning.png"}
+
+
+def test_any_kitti_sequence_with_poses_is_chosen_by_its_number(tmp_path, monkeypatch, mistake):
+    short = partial(ssp_kitti, seconds=1.0, budgets=(3600,))
+    monkeypatch.setattr("neuroslam.experiments.ssp_kitti.ssp_kitti", short)
+    for folder, bend in (("kitti_07", 0.0), ("poses", 1.0)):
+        s = np.linspace(0.0, 1.0, 40)
+        rows = np.zeros((40, 12))
+        rows[:, 3], rows[:, 11] = 30.0 * bend * s**2, 30.0 * s
+        names = ("KITTI_07_gt.txt", "KITTI_07_gt_times.txt")
+        if folder == "poses":
+            names = ("05.txt", "../sequences/05/times.txt")
+            (tmp_path / "sequences/05").mkdir(parents=True)
+        (tmp_path / folder).mkdir()
+        np.savetxt(tmp_path / folder / names[0], rows)
+        np.savetxt(tmp_path / folder / names[1], 0.1 * np.arange(40))
+    for number in ("07", "05"):
+        out = tmp_path / f"out_{number}"
+        rows = run_experiment("ssp-kitti", tmp_path, out, sequence=number)
+        assert [row["neurons"] for row in rows] == [3600, 3600]
+        assert json.loads((out / "results.json").read_text("utf-8"))["sequence"] == number
+        assert pictures(out) == {"reckoning.png"}
+    command = ("experiment", "--data", tmp_path, "-o", tmp_path / "out", "--sequence")
+    assert "expected one of 00, 01" in mistake(*command, "11", "ssp-kitti")
+    assert "KITTI sequence 04" in mistake(*command, "04", "ssp-kitti")
+    assert "leave --sequence out" in mistake(*command, "00", "ssp-map")
 
 
 def test_neurons_are_recorded_along_a_rat_s_path(shared, tmp_path):

@@ -1,5 +1,7 @@
 """The fast search gives what comparing everything gives."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
@@ -209,6 +211,23 @@ def test_of_equally_near_templates_the_first_is_found(monkeypatch, prune_from, p
     cells = memory(templates, shift_match=4, precision=precision)
     cells.last.template = 90  # a hint must not win
     assert cells.search(templates[60]).template == 20
+
+
+def test_what_follows_from_the_templates_is_renewed_with_them():
+    rng = np.random.default_rng(12)
+    first, second = smooth(rng, 700), smooth(rng, 700)
+    cells, other = memory(first, shift_match=5), memory(second, shift_match=5)
+    assert_exact(cells, first[:5])
+    cells.load_state_dict(other.state_dict())
+    assert_exact(cells, second[:5])
+    cells.templates.replace(**{name: other.templates[name][:600] for name in ("pixels", "blocks")})
+    assert_exact(cells, second[598:602])
+    for view in first[:300]:  # the table grows, and so do its tiles
+        cells.learn(view)
+    assert_exact(cells, np.concatenate([first[298:302], second[:2]]))
+    copy = deepcopy(cells)
+    copy.learn(first[500])
+    assert copy.search(first[500]).error == 0.0 < cells.search(first[500]).error
 
 
 def test_an_empty_memory_finds_nothing():

@@ -7,8 +7,10 @@ import pytest
 
 from neuroslam.errors import SourceError
 from neuroslam.worlds.landmark_paths import (
+    KITTI_SEQUENCES,
     LandmarkPath,
     band_limited_path,
+    kitti_files,
     path_of_walk,
     read_kitti,
     read_path,
@@ -142,6 +144,42 @@ def test_two_rooms_and_kitti_and_a_rat_are_paths(shared):
     assert rat.metres == pytest.approx(np.ptp(walk.positions, axis=0).max() / 1.8)
 
 
+def write_kitti(poses, times, length_m=40.0, n=50):
+    """Poses of a camera that drives ahead, climbs a fifth of it and turns right, at 10 Hz."""
+    s = np.linspace(0.0, 1.0, n)
+    rows = np.zeros((n, 12))
+    rows[:, [0, 5, 10]] = 1.0
+    rows[:, 3], rows[:, 7], rows[:, 11] = length_m * s**2 / 2, -0.2 * length_m * s, length_m * s
+    for file, table in ((poses, rows), (times, 0.1 * np.arange(n))):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savetxt(file, table)
+
+
+@pytest.mark.parametrize("sequence", KITTI_SEQUENCES)
+@pytest.mark.parametrize("archive", [False, True])
+def test_each_kitti_sequence_with_poses_is_read_from_either_layout(tmp_path, sequence, archive):
+    files = tmp_path / f"KITTI_{sequence}_gt.txt", tmp_path / f"KITTI_{sequence}_gt_times.txt"
+    if archive:
+        files = tmp_path / f"poses/{sequence}.txt", tmp_path / f"sequences/{sequence}/times.txt"
+    write_kitti(*files, length_m=10.0 * (1 + int(sequence)))
+    assert kitti_files(tmp_path, sequence) == files
+    path = read_kitti(tmp_path, sequence, time_step_s=0.05)
+    assert path.metres == pytest.approx(10.0 * (1 + int(sequence)) / 1.8)
+    x, y, z = (path.position_m[-1] - path.position_m[0]) * path.metres
+    assert (x / y, z / y) == pytest.approx((0.5, 0.2), abs=1e-6)  # right, ahead, up
+    assert path.time_s[-1] == pytest.approx(4.9)
+
+
+def test_kitti_s_times_are_asked_for_by_the_name_of_their_file(tmp_path):
+    write_kitti(tmp_path / "poses/03.txt", tmp_path / "times.txt")
+    with pytest.raises(SourceError, match=r"sequences/03/times\.txt: no such file; .*calibration"):
+        read_kitti(tmp_path, "03")
+    (tmp_path / "sequences/03").mkdir(parents=True)
+    (tmp_path / "sequences/03/times.txt").write_text("0.0\n0.1\n", encoding="utf-8")
+    with pytest.raises(SourceError, match=r"expected \(n, 12\) and \(n, 1\)"):
+        read_kitti(tmp_path, "03")
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
@@ -161,8 +199,10 @@ def test_missing_and_strange_files_are_refused(tmp_path):
         read_path(tmp_path / "none.npy")
     with pytest.raises(SourceError, match=r"a \.npy or a \.csv"):
         read_path(tmp_path / "path.txt")
-    with pytest.raises(SourceError, match="cannot be read"):
+    with pytest.raises(SourceError, match="has no poses of KITTI sequence 00"):
         read_kitti(tmp_path)
+    with pytest.raises(SourceError, match=r"'11': its true poses are not published"):
+        read_kitti(tmp_path, "11")
     with pytest.raises(SourceError, match="no frequency below"):
         band_limited_path(5.0, 0.08)
     assert isinstance(band_limited_path(20.0, 0.1), LandmarkPath)
