@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench lint format notebooks clean
+.PHONY: demo test bench bench-check lint format notebooks clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -20,6 +20,10 @@ test: $(VENV)/.installed
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.table
+
+# Fails if a row of the table takes 15 % longer, in Y, than in benchmarks/last.json.
+bench-check: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.table --check
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -22,20 +22,20 @@ def rows() -> list[Row]:
     found = []
     targets = [
         (Arena.regular(50, 1.0, "convex"), "<= 50 ms"),
-        (Arena.rooms(12, name="12 rooms with doors"), "-"),
-        (named_arena("pillar"), "-"),
+        (Arena.rooms(12, name="12 rooms with doors"), ""),
+        (named_arena("pillar"), ""),
     ]
     for arena, target in targets:
         positions = places(arena, N)
         ms = cpu_ms(lambda a=arena, p=positions: a.walls_near(p, REACH_M), 1)
         size = f"{len(positions)} x {arena.n_walls}, {arena.name}"
-        found.append(Row("walls near", size, "-", target, f"{ms:.1f} ms"))
+        found.append(Row("walls near", size, ms, target))
     arena = named_arena("square")
     one = places(arena, 1)
     ms = cpu_ms(lambda: arena.walls_near(one, REACH_M), 1000)
-    found.append(Row("walls near", "1 x 4", "-", "-", f"{ms * 1e3:.0f} us"))
+    found.append(Row("walls near", "1 x 4", ms))
     ms = cpu_ms(lambda: arena.ranges(one, [0.0], BEAMS, np.inf), 500)
-    found.append(Row("one scan cast", f"{BEAMS} beams, 4 walls", "-", "-", f"{ms * 1e3:.0f} us"))
+    found.append(Row("one scan cast", f"{BEAMS} beams, 4 walls", ms))
     scans = noisy_scans(arena, 1000)
     for where, some in (
         ("anywhere", scans),
@@ -43,7 +43,7 @@ def rows() -> list[Row]:
     ):
         ms = cpu_ms(lambda some=some: [walls_in_scan(s, REACH_M) for s in some], 1) / len(some)
         size = f"{BEAMS} beams, {where}"
-        found.append(Row("walls in a scan", size, "-", "<= 150 us", f"{ms * 1e3:.0f} us"))
+        found.append(Row("walls in a scan", size, ms, "<= 150 µs"))
     return found
 
 

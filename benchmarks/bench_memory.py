@@ -21,9 +21,9 @@ import torch
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.run import resolve_config, run
 from neuroslam.sensors import open_source
+from neuroslam.threads import limit_threads
 from neuroslam.types import Frame, StepResult, Velocity
 
 MIB = 2**20
@@ -81,7 +81,7 @@ def endless_wall() -> Iterator[Frame]:
 def live(config: BrainConfig, frames: Iterator[Frame], n: int, samples: Samples) -> dict[str, Any]:
     """Let a brain take in n frames."""
     brain = NavigationBrain(config)
-    with one_thread(), torch.inference_mode():
+    with limit_threads(), torch.inference_mode():
         for frame, _ in zip(frames, range(n), strict=False):
             samples(brain(frame))
     state = brain.state_dict()

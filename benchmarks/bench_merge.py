@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.bench_relaxation import laps
-from benchmarks.timing import Row, cpu_ms
+from benchmarks.timing import Row, cpu_ms, written
 from neuroslam.brain import NavigationBrain
 from neuroslam.brain.recognition import StoredViews
 from neuroslam.config import BrainConfig
@@ -62,7 +62,7 @@ def rows() -> list[Row]:
         assert merged is not None, report.reason
         ms = cpu_ms(lambda one=one, other=other, match=match: one.merge(other, match), 1, 5)
         target = "<= 500 ms" if n == TARGET else "linear"
-        found.append(Row("merge of two maps", f"{n} places each", "-", target, f"{ms:.0f} ms"))
+        found.append(Row("merge of two maps", f"{n} places each", ms, target))
     rng = np.random.default_rng(3)
     maps = [mapped(2_500, seed).view for seed in range(8)]
     view = rng.integers(0, 256, (10, 60)) / 255.0
@@ -71,15 +71,7 @@ def rows() -> list[Row]:
         once = cpu_ms(lambda joined=joined: joined.search(view), 20)
         each = cpu_ms(lambda k=k: [one.search(view, 0.05) for one in maps[:k]], 20)
         size = f"{k} stored maps of 2500 places"
-        found.append(
-            Row(
-                "a view among stored maps",
-                size,
-                "-",
-                "one search",
-                f"{once:.2f} ms, one by one {each:.2f} ms",
-            )
-        )
+        found.append(Row("a view among stored maps", size, once, "", f"one by one {written(each)}"))
     return found
 
 

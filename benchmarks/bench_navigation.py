@@ -100,25 +100,24 @@ def rows() -> list[Row]:
         ("circle2m", lambda: Rat().steps, "<= 1.5 s"),
         ("triangle", lambda: Rat(arena="triangle").steps, "<= 1.5 s"),
         ("circle2m, rates recorded", lambda: Rat().recorded_steps, "<= 2 s"),
-        ("circle2m, walls by cells", lambda: Rat(walls_by="boundary_cells").steps, "-"),
+        ("circle2m, walls by cells", lambda: Rat(walls_by="boundary_cells").steps, ""),
     ):
         off, on = without_and_with(make)
-        measured = f"{on:.1f} s, {off:.1f} s if not compiled"
-        found.append(Row("navigation cells, one animal", f"30 min, {what}", "-", target, measured))
+        beside = f"not compiled {off:.1f} s"
+        size = f"30 min, {what}"
+        found.append(Row("navigation cells, one animal", size, 1e3 * on, target, beside))
     rats = Rat(BATCH)
     rats.steps(WARM)
     ms = cpu_ms(lambda: rats.steps(TIMED // 4), 1, 5) / (TIMED // 4) / BATCH
     s = ms * STEPS_30_MIN / 1e3
-    found.append(
-        Row(f"the same, a batch of {BATCH}", "circle2m", "-", "<= 1 s an animal", f"{s:.2f} s")
-    )
+    found.append(Row(f"the same, one of a batch of {BATCH}", "30 min, circle2m", 1e3 * s, "<= 1 s"))
     for n in RECRUITED:
         rat = Rat()
         rat.steps(200)
         rat.recruit(n)
         rat.steps(200)
         ms = cpu_ms(lambda rat=rat: rat.steps(TIMED), 1, 5) / TIMED
-        found.append(Row("a step", f"{n} place cells", "-", "-", f"{ms * 1e3:.0f} us"))
+        found.append(Row("navigation cells, a step", f"{n} place cells", ms))
     return found
 
 

@@ -1,42 +1,83 @@
-"""Run every benchmark and print one table: ``python -m benchmarks.table``."""
+"""Run the benchmarks and print one table: ``python -m benchmarks.table``.
+
+``--write`` keeps it in ``benchmarks/last.json``; ``--check`` fails if a row takes 15 % longer, in
+Y, than there. ``--only NAME`` runs the modules whose names contain NAME.
+"""
+
+import argparse
+import json
+import platform
+import sys
+from importlib import import_module
+from pathlib import Path
 
 import cv2
 import torch
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks import (
-    bench_arena,
-    bench_batches,
-    bench_end_to_end,
-    bench_merge,
-    bench_navigation,
-    bench_pose_cells,
-    bench_relaxation,
-    bench_ssp,
-    bench_view_search,
-)
+from benchmarks.timing import Row, written, yardstick_ms
+
+MODULES = (
+    "pose_cells", "view_search", "relaxation", "merge", "arena", "navigation", "ssp", "batches",
+    "end_to_end",
+)  # fmt: skip
+LAST = Path(__file__).with_name("last.json")
+LOSS = 1.15
+HEAD = ("step", "size", "here", "in Y", "target", "beside", "more")
 
 
-def main() -> None:
+def machine() -> str:
+    """Name the processor and what it runs."""
+    names = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ] if Path("/proc/cpuinfo").is_file() else [platform.processor()]  # fmt: skip
+    return f"{names[0]}, Python {platform.python_version()}, torch {torch.__version__}"
+
+
+def measured(only: str) -> dict[str, tuple[float, Row]]:
+    """Run the modules: step and size -> time in Y, and the row."""
+    found = {}
+    for name in MODULES:
+        if only in name:
+            y = yardstick_ms()
+            for row in import_module(f"benchmarks.bench_{name}").rows():
+                found[f"{row.step} | {row.size}"] = row.ms / y, row
+                print(f"  {row.step}, {row.size}: {written(row.ms)}", file=sys.stderr)
+    return found
+
+
+def lost(now: dict[str, float], last: dict[str, float]) -> list[str]:
+    """Say which rows take longer than they did, by 15 % or more."""
+    return [
+        f"{name}: {now[name]:.4g} Y, last {last[name]:.4g} Y"
+        for name in now.keys() & last.keys()
+        if now[name] > LOSS * last[name]
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--only", default="")
+    asked = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    table = Table("step", "size", "C++ reference", "target", "measured here")
-    for module in (
-        bench_pose_cells,
-        bench_view_search,
-        bench_relaxation,
-        bench_merge,
-        bench_arena,
-        bench_navigation,
-        bench_ssp,
-        bench_batches,
-        bench_end_to_end,
-    ):
-        for row in module.rows():
-            table.add_row(*row)
-    Console(width=130).print(table)
+    found = measured(asked.only)
+    print(f"{machine()}; Y = {yardstick_ms():.2f} ms\n")
+    print("| " + " | ".join(HEAD) + " |")
+    print("|---" * len(HEAD) + "|")
+    for y, row in found.values():
+        cells = (row.step, row.size, written(row.ms), f"{y:.3g}", row.target, row.beside, row.more)
+        print("| " + " | ".join(cells) + " |")
+    now = {name: y for name, (y, _) in found.items()}
+    if asked.write:
+        LAST.write_text(json.dumps({k: round(v, 5) for k, v in now.items()}, indent=1) + "\n")
+    slower = lost(now, json.loads(LAST.read_text())) if asked.check else []
+    print(*slower, sep="\n")
+    return 1 if slower else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -62,6 +62,12 @@ def inputs(tmp_path_factory):
         (home / name).write_text("\n".join(["time_s,v_m_s,w_rad_s", *rows]) + "\n")
     poses = [f"{k / 20.0} {f.truth.x_m} {f.truth.y_m} 0 0 0 {np.sin(f.truth.theta_rad / 2)} "
              f"{np.cos(f.truth.theta_rad / 2)}" for k, f in enumerate(frames)]  # fmt: skip
+    other_clock = [f"{1_700_000_000.05 + k / 20.0:.6f},{f.velocity.v_m_s},{f.velocity.w_rad_s}"
+                   for k, f in enumerate(frames)]  # fmt: skip
+    (home / "motion.csv").write_text("\n".join(["time_s,v_m_s,w_rad_s", *other_clock]) + "\n")
+    camera_axes = [f"{k / 20.0} {-f.truth.y_m} 0 {f.truth.x_m} 0 {-np.sin(f.truth.theta_rad / 2)} "
+                   f"0 {np.cos(f.truth.theta_rad / 2)}" for k, f in enumerate(frames)]  # fmt: skip
+    (home / "orb_slam.tum").write_text("\n".join(camera_axes) + "\n")
     (home / "landmarks.csv").write_text("kind,number,name,words,corners\n,0,DOOR,BLUE * DOOR,\n")
     (home / "truth.tum").write_text("\n".join(poses) + "\n")
     angle = np.linspace(0.0, 20.0, 1500)

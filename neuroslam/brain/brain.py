@@ -19,6 +19,7 @@ from neuroslam.sensors.frames import (
 from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
 from neuroslam.state.sessions import Session, session_id
+from neuroslam.threads import is_plain, limit_threads, without_autocast
 from neuroslam.types import (
     NO_TEMPLATE,
     Frame,
@@ -87,7 +88,7 @@ class NavigationBrain(BrainState):
 
     @torch.inference_mode()
     def forward(self, frame: Frame) -> StepResult:
-        """Advance by one frame.
+        """Advance by one frame, on ``config.threads`` CPU threads and without autocast.
 
         Raises:
             BadFrame: If the time does not increase, the data is invalid, or there is neither
@@ -99,6 +100,13 @@ class NavigationBrain(BrainState):
         """
         if self.half_taken:
             raise RuntimeError(self.half_taken)
+        if is_plain(self.config.threads):
+            return self._take(frame)
+        with limit_threads(self.config.threads), without_autocast():
+            return self._take(frame)
+
+    def _take(self, frame: Frame) -> StepResult:
+        """Check a frame and advance by it."""
         accepted = self._accept(frame)
         try:
             return self._advance(accepted)

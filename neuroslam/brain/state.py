@@ -1,12 +1,13 @@
 """State of a brain: modules, populations, sessions, and stored maps."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self, SupportsIndex
 
 import numpy as np
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
@@ -26,10 +27,12 @@ from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, QuickModule, State
+from neuroslam.state.pickling import Calls, as_arrays, as_tensors
 from neuroslam.state.population import Population
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
 from neuroslam.state.tables import Scalars
+from neuroslam.threads import limit_threads
 from neuroslam.types import NO_TEMPLATE, Frame, Pose, ViewMatch
 from neuroslam.view.features import Encoder, view_encoder
 from neuroslam.view.templates import LocalViewCells
@@ -95,8 +98,51 @@ class BrainState(QuickModule):
         self.stored = ModulesOf()
         self._begin()
         self.register_load_state_dict_pre_hook(_make_stored)
-        self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
+        self.register_load_state_dict_post_hook(Calls("_loaded"))
         self.register_state_dict_pre_hook(_refuse_half_taken)
+        # Attributes that a pickle makes anew; a subclass may have more.
+        self._own = frozenset((*self.__dict__, *self._modules, "_own"))
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        """Return how a pickle makes the brain anew: from its config, its network and its state.
+
+        Raises:
+            RuntimeError: If the state is not that of any frame, see :attr:`half_taken`.
+        """
+        attributes = self.__dict__ | self._modules  # parts that were found are in both
+        more = {name: value for name, value in attributes.items() if name not in self._own}
+        others = tuple(f"{name}." for name in more)
+        state = {
+            name: array
+            for name, array in as_arrays(self.state_dict()).items()
+            if not name.startswith(others)
+        }
+        more |= {name: self.__dict__[name] for name in ("about", "training", "_after_gap_s")}
+        device = str(self.map.experiences["pose"].device)
+        return _rebuilt, (type(self), self.config, self._encoder, state, more, device)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move all tensors, as ``.to(device)`` does; they keep their types.
+
+        Raises:
+            TypeError: If a type would change: a brain goes on bit for bit only in its own.
+        """
+        for dtype in (torch.float32, torch.float64):
+            to = fn(torch.empty(0, dtype=dtype)).dtype
+            if to != dtype:
+                raise TypeError(
+                    f"{type(self).__name__}: cannot be converted from {dtype} to {to}: its "
+                    "activity is float32, its positions and times are float64; use .to(device) "
+                    "alone"
+                )
+        return super()._apply(fn, recurse)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return a copy with all parts and attributes, which shares no memory with this brain."""
+        copied = type(self).__new__(type(self))
+        memo[id(self)] = copied
+        copied.__dict__.update(deepcopy(self.__dict__, memo))
+        return copied
 
     def _begin(self) -> None:
         """Start with an empty map."""
@@ -376,6 +422,24 @@ class BrainState(QuickModule):
 
 def _overrides(population: type[Population], hook: str) -> bool:
     return getattr(population, hook) is not getattr(Population, hook)
+
+
+def _rebuilt(
+    brain_class: type[BrainState],
+    config: BrainConfig,
+    encoder: Encoder,
+    state: dict[str, np.ndarray],
+    more: dict[str, Any],
+    device: str,
+) -> BrainState:
+    """Make a brain of what a pickle holds."""
+    brain = brain_class.__new__(brain_class)
+    with limit_threads(config.threads):
+        BrainState.__init__(brain, config, features=encoder)
+        brain.load_state_dict(as_tensors(state))
+    for name, value in more.items():
+        setattr(brain, name, value)
+    return brain if device == "cpu" else brain.to(device)
 
 
 def _refuse_half_taken(module: BrainState, *_unused: object) -> None:

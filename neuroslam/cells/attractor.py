@@ -501,10 +501,10 @@ def _move(
                 for k in range(c):
                     value = weight_y * values[(i * b + j) * c + k]
                     to = k + shift_x
-                    plane[row + (to if to < c_out else to - torus[2])] += (1.0 - ahead_x) * value
+                    plane[row + (to if to < c_out else to % torus[2])] += (1.0 - ahead_x) * value
                     if ahead_x > 0.0:
                         to += 1
-                        plane[row + (to if to < c_out else to - torus[2])] += ahead_x * value
+                        plane[row + (to if to < c_out else to % torus[2])] += ahead_x * value
         for up in range(2):
             weight = ahead_theta if up else 1.0 - ahead_theta
             if weight > 0.0:

@@ -6,7 +6,7 @@ and the merge of two sessions. The model is that of Skaggs et al. (1995,
 """
 
 import math
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from functools import lru_cache
 from typing import Literal, NamedTuple, cast
 
@@ -617,7 +617,7 @@ class HeadDirectionCells(Population):
             self.views.replace(heading_rad=(old + turn + math.pi) % TWO_PI - math.pi)
         self.last.anchored = 1
 
-    def _apply(self, fn: object, recurse: bool = True) -> "HeadDirectionCells":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HeadDirectionCells":
         super()._apply(fn, recurse)
         like, self._decoded = self.activity, (None, 0.0)
         moved = {k: v.to(like) for k, v in self.ring._asdict().items() if isinstance(v, Tensor)}

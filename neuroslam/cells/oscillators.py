@@ -1,6 +1,7 @@
 """Velocity-controlled oscillators: phases that advance with displacement along a direction."""
 
 import math
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from neuroslam.compiled import compiled
 from neuroslam.config import GridCellConfig
 from neuroslam.state.mergeable import Arrays, BufferModule
+from neuroslam.state.pickling import Calls
 
 
 def wave_vectors(spacing_m: Tensor, orientation_rad: Tensor, directions: int) -> Tensor:
@@ -167,7 +169,7 @@ class VelocityOscillators(BufferModule):
         self.register_buffer("position_m", torch.zeros(*lead, 2, dtype=kind))
         self._waves: tuple[int, Tensor, Tensor] | None = None  # follow from the spacings
         self._wave_arrays: tuple[Tensor, np.ndarray, np.ndarray] | None = None
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget_waves())
+        self.register_load_state_dict_post_hook(Calls("_forget_waves"))
 
     @property
     def waves(self) -> Tensor:
@@ -190,7 +192,7 @@ class VelocityOscillators(BufferModule):
                 self._waves = version, waves, torch.linalg.pinv(waves.flatten(0, 1))
         return self._waves[1:]
 
-    def _apply(self, fn: object, recurse: bool = True) -> "VelocityOscillators":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VelocityOscillators":
         self._waves = None
         return super()._apply(fn, recurse)
 

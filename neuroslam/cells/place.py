@@ -10,6 +10,7 @@ from torch import Tensor
 from neuroslam.compiled import compiled
 from neuroslam.config import PlaceCellConfig
 from neuroslam.state.mergeable import Arrays, BufferModule, without_gradients
+from neuroslam.state.pickling import Calls
 from neuroslam.state.tables import Scalars
 
 NEIGHBOURS = 12
@@ -349,9 +350,9 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         self.register_buffer("threshold_m", torch.tensor(config.threshold_m, dtype=torch.float64))
         self.now = Stay()
         self._near: tuple[Tensor, Tensor] | None = None  # weights and centres of the window
-        self.register_state_dict_pre_hook(lambda module, *_: module._write_back())
+        self.register_state_dict_pre_hook(Calls("_write_back"))
         self.register_load_state_dict_pre_hook(_take_capacity)
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget_window())
+        self.register_load_state_dict_post_hook(Calls("_forget_window"))
 
     @property
     def capacity(self) -> int:

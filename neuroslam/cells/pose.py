@@ -32,6 +32,7 @@ from neuroslam.geometry import TWO_PI
 from neuroslam.state.join import Join, MovedCells
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, renamed
+from neuroslam.state.pickling import Calls
 from neuroslam.state.population import (
     Belief,
     Correction,
@@ -133,9 +134,9 @@ class PoseCellNetwork(Population):
         self._loops: tuple[np.ndarray, ...] | None = None  # kernels and headings of compiled steps
         # The state in use is here: writing buffers in each step would cost more than the cells.
         self._now = _Now(Packet(self.window, (0, 0, 0), self.shape), slip)
-        self.register_state_dict_pre_hook(lambda module, *_: module._write_buffers())
+        self.register_state_dict_pre_hook(Calls("_write_buffers"))
         self.register_load_state_dict_pre_hook(_take_window_size)
-        self.register_load_state_dict_post_hook(lambda module, _: module._read_buffers())
+        self.register_load_state_dict_post_hook(Calls("_read_buffers"))
         self.reset()
 
     def reset(self) -> None:

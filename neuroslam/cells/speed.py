@@ -6,7 +6,7 @@ and the merge of two sessions. After Kropff et al. (2015, *Nature* 523:
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, Self, cast
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BrainConfig, Section
 from neuroslam.state.mergeable import Arrays, about_now, without_gradients
+from neuroslam.state.pickling import Calls
 from neuroslam.state.population import Population, StepInput
 from neuroslam.state.registry import register
 from neuroslam.types import Motion
@@ -253,8 +254,8 @@ class SpeedCells(Population):
         self.register_buffer("rates_hz", tuning.rest_hz.repeat(*animals, 1).view(*animals, -1))
         self.register_buffer("draws", self._draw.get_state())
         self.readout = fit_readout(tuning, self.config.max_speed_m_s)
-        self.register_state_dict_pre_hook(lambda cells, *_: cells._write_draws())
-        self.register_load_state_dict_post_hook(lambda cells, _: cells._read())
+        self.register_state_dict_pre_hook(Calls("_write_draws"))
+        self.register_load_state_dict_post_hook(Calls("_read"))
 
     @property
     def tuning(self) -> SpeedTuning:
@@ -306,7 +307,7 @@ class SpeedCells(Population):
         self._draw.set_state(self.draws.cpu())
         self.readout = fit_readout(self.tuning, self.config.max_speed_m_s)
 
-    def _apply(self, fn: object, recurse: bool = True) -> "SpeedCells":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "SpeedCells":
         super()._apply(fn, recurse)
         self.readout = self.readout.to(self.rates_hz)
         return self

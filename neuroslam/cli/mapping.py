@@ -9,11 +9,13 @@ from rich.table import Table
 
 from neuroslam.cli.options import (
     Assignments,
+    Axes,
     BadFrame,
     ConfigFile,
     Confirm,
     Landmarks,
     NoTensorboard,
+    Offset,
     OnBadFrame,
     Out,
     Overwrite,
@@ -51,6 +53,8 @@ def run_command(
     confirm: Confirm = None,
     landmarks: Landmarks = None,
     truth: Truth = None,
+    axes: Axes = None,
+    offset: Offset = None,
     start: Start = 0,
     stop: Stop = None,
     on_bad_frame: BadFrame = OnBadFrame.stop,
@@ -75,6 +79,8 @@ def run_command(
             maps=maps or (),
             landmarks=landmarks,
             truth=truth,
+            axes=axes,
+            offset=offset,
             preset=preset or "",
             start=start,
             stop=stop,
@@ -156,6 +162,10 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     from neuroslam.runs.inspect import shown_count
 
     figures = summary.to_dict()
+    for note in summary.notes:
+        say(note)
+    for warning in summary.warnings:
+        complain(command, f"warning: {warning}")
     for note in summary.skipped[:3]:
         complain(command, f"skipped: {note}")
     if len(summary.skipped) > 3:
@@ -188,24 +198,41 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
             f"{summary.unplaced} of {summary.frames} frames are on maps that were not joined; "
             "if the robot was not kidnapped: --set sessions.kidnapped=ignore"
         )
-    if summary.accuracy:
-        say(
-            f"ATE (rigid): map {summary.accuracy['ate_rmse_m']:.3f} m, "
-            f"odometry alone {summary.accuracy['odometry_ate_rmse_m']:.3f} m"
-        )
-    if "ate_similarity_rmse_m" in summary.accuracy:
-        say(
-            f"ATE (similarity): map {summary.accuracy['ate_similarity_rmse_m']:.3f} m, over "
-            f"{counted(int(summary.accuracy['frames_with_truth']), 'frame')} with truth"
-        )
+    for line in _accuracy_lines(summary):
+        say(line)
     say(f"Written: {out}")
     if summary.failure:
-        complain(command, f"stopped early: {summary.failure}")
+        skips = summary.bad_frame and command == "run"
+        hint = "; or leave out such frames: --on-bad-frame skip" if skips else ""
+        complain(command, f"stopped early: {summary.failure}{hint}")
         return USER_ERROR
     if summary.interrupted:
         complain(command, f"interrupted; continue with: neuroslam resume {out}")
         return INTERRUPTED
     return 0
+
+
+def _accuracy_lines(summary: "RunSummary") -> list[str]:
+    """Return the errors against the truth: those with a free scale first, for one camera alone."""
+    found = summary.accuracy
+    if not found:
+        return []
+    known = int(found["frames_with_truth"])
+    unit = "arbitrary unit" if summary.measured is False else "m"
+    lines = [
+        f"ATE (rigid): map {found['ate_rmse_m']:.3f} {unit}, "
+        f"odometry alone {found['odometry_ate_rmse_m']:.3f} {unit}"
+    ]
+    if "ate_similarity_rmse_m" in found:
+        lines.append(
+            f"ATE (similarity): map {found['ate_similarity_rmse_m']:.3f} m, over "
+            f"{counted(known, 'frame')} with truth"
+        )
+    if summary.measured is False:
+        lines = [f"{lines[1]}; the scale is unknown (one camera)", lines[0]]
+    if known < summary.frames:
+        lines.append(f"{known:,} of {counted(summary.frames, 'frame')} have truth")
+    return lines
 
 
 def _print_not_joined(summary: "RunSummary") -> None:

@@ -54,6 +54,22 @@ Truth = Annotated[
         metavar="FILE", help="Ground truth: a TUM file, or a CSV of time_s,x_m,y_m[,theta_rad]."
     ),
 ]
+Axes = Annotated[
+    str | None,
+    typer.Option(
+        metavar="AXES",
+        help="Axes of the ground plane in the truth: robot (x, y; the default), camera (z, -x), or "
+        "those that point ahead and left.",
+    ),
+]
+Offset = Annotated[
+    str | None,
+    typer.Option(
+        metavar="S",
+        help="With VIDEO+MOTION.csv: seconds to add to the times of the motion; auto: by the turn "
+        "rates.",
+    ),
+]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
 ConfigFile = Annotated[

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.table import Table
 
-from neuroslam.cli.options import Landmarks, MapFile, RunFolder, Truth
+from neuroslam.cli.options import Axes, Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
 from neuroslam.cli.tables import new_table
 from neuroslam.errors import RunError, counted
@@ -141,10 +141,12 @@ def plan_command(
     from neuroslam.runs.plan import plan
 
     found = plan(path, goal, out, start)
-    beside = f", {found.beside_m:.2f} m from {goal}" if found.beside_m else ""
+    unit = found.unit
+    beside = f", {found.beside_m:.2f} {unit} from {goal}" if found.beside_m else ""
     say(
         f"From experience {found.path[0]} to {found.path[-1]}{beside}: "
-        f"{counted(len(found.path) - 1, 'link')}, {found.length_m:.2f} m, {found.duration_s:.1f} s"
+        f"{counted(len(found.path) - 1, 'link')}, {found.length_m:.2f} {unit}, "
+        f"{found.duration_s:.1f} s"
     )
     say(f"Written: {', '.join(str(file) for file in found.files)}")
     return 0
@@ -153,7 +155,17 @@ def plan_command(
 def evaluate_command(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
     truth: Truth = None,
-    align: Annotated[str, typer.Option(help="rigid, similarity or none.")] = "rigid",
+    align: Annotated[
+        str | None,
+        typer.Option(
+            help="rigid, similarity or none; default: rigid, for one camera similarity first."
+        ),
+    ] = None,
+    axes: Axes = None,
+    track_axes: Annotated[
+        str | None,
+        typer.Option(metavar="AXES", help="The same of TRACK, if it is a TUM file."),
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(metavar="RUN", help="Compare the map with that of another run, by ICP."),
@@ -187,12 +199,14 @@ def evaluate_command(
         say(f"Written: {figure}")
         return 0
 
-    table = Table(title=f"{track} and ground truth, {align} alignment")
+    how = f", {align} alignment" if align else ""
+    table = Table(title=f"{track} and ground truth{how}")
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []
-    mode = cast("AlignmentMode", align)  # looked at there
-    for name, found, unit in evaluate(track, truth, mode, notes.append):
+    mode = cast("AlignmentMode | None", align)  # looked at there
+    errors = evaluate(track, truth, mode, notes.append, axes, track_axes)
+    for name, found, unit in errors:
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
     say(table)
     for note in notes:

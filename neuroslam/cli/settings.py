@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from neuroslam.cli.options import Assignments, ConfigFile, Out, Preset, Source, Stop
+from neuroslam.cli.options import Assignments, ConfigFile, Offset, Out, Preset, Source, Stop
 from neuroslam.cli.output import say
 from neuroslam.cli.progress import show_stages
 from neuroslam.cli.tables import new_table, shown
@@ -17,20 +17,26 @@ def tune_command(
     preset: Preset = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
+    offset: Offset = None,
     stop: Stop = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier tuning in the folder.")
     ] = False,
 ) -> int:
     """Tune parameters from the images of a SOURCE, without ground truth; write a config."""
+    from neuroslam.runs.clocks import resolve_offset
     from neuroslam.runs.run import resolve_config
     from neuroslam.tuning import tune
 
+    settings = resolve_config(preset, config, tuple(assignments or ()))
+    source, told = resolve_offset(source, offset, settings)
+    for note in told:
+        say(note)
     with show_stages("tune") as on_stage:
         tuning = tune(
             source,
             out,
-            resolve_config(preset, config, tuple(assignments or ())),
+            settings,
             stop=stop,
             overwrite=overwrite,
             on_stage=on_stage,

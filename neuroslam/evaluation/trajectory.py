@@ -1,6 +1,7 @@
 """Error of a track against the truth: alignment, ATE, RPE, shape; TUM trajectory files."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -255,8 +256,33 @@ def write_tum(path: Path, track: Track) -> None:
     write_atomically(Path(path), lambda file: file.write_text("".join(lines), encoding="ascii"))
 
 
+class TumFile(NamedTuple):
+    """Content of a TUM file: times in s ``(n,)``, positions in m, quaternions x, y, z, w."""
+
+    times_s: np.ndarray
+    positions: np.ndarray
+    quaternions: np.ndarray
+
+
 def read_tum(path: Path) -> Track:
     """Read TUM lines ``time x y z qx qy qz qw``; height, roll and pitch are ignored.
+
+    Raises:
+        SourceError: If the file is missing or a line is invalid; the message has its number.
+    """
+    t, positions, q = read_tum_file(path)
+    (qx, qy, qz, qw), norm = q.T, np.square(q).sum(axis=1)
+    yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy**2 + qz**2))
+    return Track(t, np.column_stack([positions[:, :2], yaw]))
+
+
+def read_tum_file(path: Path, on_bad_line: Callable[[str], object] | None = None) -> TumFile:
+    """Read TUM lines ``time x y z qx qy qz qw``.
+
+    Args:
+        path: The file.
+        on_bad_line: Called with the fault of each invalid line, which is then left out; ``None``:
+            the fault is raised. Half of the lines or more are a fault of the file.
 
     Raises:
         SourceError: If the file is missing or a line is invalid; the message has its number.
@@ -268,23 +294,28 @@ def read_tum(path: Path) -> Track:
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"trajectory {path}: cannot be read as text ({error})") from None
     rows: list[list[float]] = []
+    faults: list[str] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         wrong = _tum_fault(line, rows)
         if wrong:
-            raise SourceError(
-                f"trajectory {path}, line {number}: {wrong}; "
-                "expected 'time x y z qx qy qz qw', times rising"
+            faults.append(
+                f"line {number}: {wrong}; expected 'time x y z qx qy qz qw', times rising"
             )
+            if on_bad_line is None:
+                break
+    if faults and (on_bad_line is None or len(faults) >= len(rows)):
+        raise SourceError(f"trajectory {path}, {faults[0]}")
     if not rows:
         raise SourceError(
             f"trajectory {path}: has no pose; expected lines 'time x y z qx qy qz qw'"
         )
-    t, x, y, _, qx, qy, qz, qw = np.array(rows).T
-    norm = qx**2 + qy**2 + qz**2 + qw**2
-    yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy**2 + qz**2))
-    return Track(t, np.column_stack([x, y, yaw]))
+    for fault in faults:
+        if on_bad_line is not None:
+            on_bad_line(fault)
+    table = np.array(rows)
+    return TumFile(table[:, 0], table[:, 1:4], table[:, 4:])
 
 
 def _tum_fault(line: str, rows: list[list[float]]) -> str:

@@ -16,8 +16,9 @@ from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.figures.comparison import plot_comparison, plot_losses
 from neuroslam.figures.style import save
 from neuroslam.geometry import integrate_velocities
-from neuroslam.runs.parallel import one_thread, parallel_map
+from neuroslam.runs.parallel import parallel_map
 from neuroslam.sensors import open_source
+from neuroslam.threads import limit_threads
 from neuroslam.types import NO_EXPERIENCE, Frame, Pose
 
 WORLDS = ("corridor", "ellipse")
@@ -241,7 +242,7 @@ def run_brain(
     brain, at, cpu_s = NavigationBrain(config), [], 0.0
     if prepare is not None:
         prepare(brain)
-    with one_thread(1), torch.inference_mode():
+    with limit_threads(1), torch.inference_mode():
         for frame in frames:
             begin = time.process_time()
             brain(frame)

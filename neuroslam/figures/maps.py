@@ -48,6 +48,7 @@ def plot_map(
     odometry_of: str = "",
     planned: np.ndarray | None = None,
     title: str | None = None,
+    unit: str = "m",
 ) -> Figure:
     """Draw the experience map, beside dead reckoning by its odometry.
 
@@ -71,6 +72,7 @@ def plot_map(
         planned: Positions of a planned path, ``(p, 2)``; its start and goal are marked then, and
             not the first and last experience.
         title: Title of the whole figure.
+        unit: Unit of the axes: a map by one camera alone has an arbitrary one.
 
     Raises:
         ValueError: If the truth and the track differ in length.
@@ -85,6 +87,8 @@ def plot_map(
             axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks, session,
             session_names, planned,
         )  # fmt: skip
+        for panel in axes:
+            panel.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     return figure
 
 

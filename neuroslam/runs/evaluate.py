@@ -18,28 +18,51 @@ from neuroslam.evaluation.trajectory import (
     read_tum,
     relative_pose_error,
 )
+from neuroslam.evaluation.trajectory import (
+    align as align_tracks,
+)
 from neuroslam.figures.sessions import plot_overlay
 from neuroslam.figures.style import save
 from neuroslam.runs.files import brain_file
-from neuroslam.runs.reading import read_trace, track_file, true_poses
+from neuroslam.runs.reading import read_metrics, read_trace, track_file, true_poses
 from neuroslam.runs.truth import read_truth
+
+_NOTED_SCALE = 1.1
+"""A scale that differs from 1 by more is noted, if it explains most of the error."""
+
+
+class _Pairs(NamedTuple):
+    """Poses of a track and of the truth at the same instants, and the frames of the track."""
+
+    estimate: np.ndarray
+    truth: np.ndarray
+    n_frames: int
 
 
 def evaluate(
     track: str | Path,
     truth: str | Path | None = None,
-    align: AlignmentMode = "rigid",
-    on_note: Callable[[str], None] | None = None,
+    align: AlignmentMode | None = None,
+    on_note: Callable[[str], object] | None = None,
+    axes: str | None = None,
+    track_axes: str | None = None,
 ) -> list[tuple[str, ErrorStatistics, str]]:
     """Compare the trajectory of a run, or of a TUM file, with the ground truth.
+
+    One camera measures no scale: without ``align``, the errors of a run without measured motion
+    are those after a similarity alignment, and the rigid one follows.
 
     Args:
         track: Folder of a run, or a TUM file.
         truth: TUM file, or CSV (:func:`~neuroslam.runs.truth.read_truth`); not needed for a run
             whose source knows the truth, or that was made with a truth file.
-        align: How the track is aligned with the truth before the comparison.
-        on_note: Called with a note if frames without a true pose are left out, or headings are
-            unknown: there is no relative error then.
+        align: How the track is aligned with the truth before the comparison; ``None``: rigid, and
+            similarity first for one camera alone.
+        on_note: Called with a note if frames have no true pose, headings or the scale are unknown,
+            or on how a file was read.
+        axes: Axes of the ground plane in the file of truth, see
+            :func:`~neuroslam.sensors.axes.parse_axes`; default: x and y.
+        track_axes: The same of a TUM file of the track.
 
     Returns:
         Name of the error, its statistics, its unit.
@@ -47,48 +70,123 @@ def evaluate(
     Raises:
         NeuroslamError: If a file is missing or damaged, or there is no truth to compare with.
     """
-    track = Path(track)
-    if align not in get_args(AlignmentMode):
+    track, note = Path(track), on_note or (lambda _: None)
+    if align is not None and align not in get_args(AlignmentMode):
         raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
-    out = track if track.is_dir() else None
-    found = read_tum(track if out is None else track_file(out))
-    if truth is not None:
-        true = read_truth(truth)
-        i, j = associate(found.times_s, true.times_s)
-        estimate, reference = found.poses[i], true.poses[j]
-    else:
-        trace = None if out is None else read_trace(out, len(found.times_s))
-        true_track = None if trace is None else true_poses(trace)
-        if trace is None or true_track is None:
-            raise RunError(
-                f"{track}: its source has no ground truth; give a TUM file or CSV with --truth FILE"
-            )
-        i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
-        known = np.isfinite(true_track[j, 0])
-        estimate, reference = found.poses[i[known]], true_track[j[known]]
+    pairs = _pairs(track, truth, axes, track_axes, note)
+    estimate, reference, n_frames = pairs
     if len(estimate) < 2:
         check = "" if truth is None else f"; is {truth} the truth of this track?"
         raise RunError(
             f"{track}: a true pose within 0.02 s for {len(estimate)} of "
-            f"{counted(len(found.times_s), 'frame')}; expected at least 2 frames{check}"
+            f"{counted(n_frames, 'frame')}; expected at least 2 frames{check}"
         )
-    n_frames = len(found.times_s)
-    if on_note is not None and len(estimate) < n_frames:
-        on_note(
-            f"{len(estimate)} of {counted(n_frames, 'frame')} have a true pose; "
-            "the errors are over those"
+    if len(estimate) < n_frames:
+        note(
+            f"{len(estimate)} of {counted(n_frames, 'frame')} have truth; the errors are over those"
         )
-    absolute = absolute_trajectory_error(estimate[:, :2], reference[:, :2], align)
+    lone_camera = track.is_dir() and _measured(track) is False
+    if align is None and lone_camera:
+        return _of_lone_camera(estimate, reference, note)
+    mode: AlignmentMode = align or "rigid"
+    absolute = absolute_trajectory_error(estimate[:, :2], reference[:, :2], mode)
+    if lone_camera and mode != "similarity":
+        note("the scale is unknown, as one camera measures none; --align similarity frees it")
+    elif align is None:
+        _note_scale(estimate, reference, absolute, note)
+    return [("absolute (ATE)", absolute, "m"), *_relative(estimate, reference, "m", note)]
+
+
+def _pairs(
+    track: Path,
+    truth: str | Path | None,
+    axes: str | None,
+    track_axes: str | None,
+    note: Callable[[str], object],
+) -> _Pairs:
+    out = track if track.is_dir() else None
+    if track_axes is not None and out is not None:
+        raise RunError(f"--track-axes {track_axes}: are those of a TUM file; {track} is a run")
+    if axes is not None and truth is None:
+        raise RunError(f"--axes {axes}: are those of a file of truth; give --truth FILE too")
+    if out is not None:
+        found = read_tum(track_file(out))
+    else:
+        found = read_truth(track, track_axes, note, "--track-axes camera")
+    if truth is not None:
+        true = read_truth(truth, axes, note)
+        i, j = associate(found.times_s, true.times_s)
+        return _Pairs(found.poses[i], true.poses[j], len(found.times_s))
+    trace = None if out is None else read_trace(out, len(found.times_s))
+    true_track = None if trace is None else true_poses(trace)
+    if trace is None or true_track is None:
+        raise RunError(
+            f"{track}: its source has no ground truth; give a TUM file or CSV with --truth FILE"
+        )
+    i, j = associate(found.times_s, trace["time_s"])  # a frame may be on no map
+    known = np.isfinite(true_track[j, 0])
+    return _Pairs(found.poses[i[known]], true_track[j[known]], len(found.times_s))
+
+
+def _measured(out: Path) -> bool | None:
+    """Return whether a run had measured motion; ``None`` if its figures do not say it."""
+    try:
+        return read_metrics(out).get("measured_motion")
+    except RunError:
+        return None
+
+
+def _of_lone_camera(
+    estimate: np.ndarray, reference: np.ndarray, note: Callable[[str], object]
+) -> list[tuple[str, ErrorStatistics, str]]:
+    """Return the errors with a free scale, then the absolute one without."""
+    scale = align_tracks(estimate[:, :2], reference[:, :2], "similarity").scale
+    note(
+        f"the scale is unknown, as one camera measures none: 1 unit of the map is {scale:.4g} m of "
+        "the truth; the errors with that scale come first"
+    )
+    scaled = estimate * [scale, scale, 1.0]
+    both = [
+        (f"ATE ({mode})", absolute_trajectory_error(xy[:, :2], reference[:, :2], "rigid"))
+        for mode, xy in (("similarity", scaled), ("rigid", estimate))
+    ]
+    (first, free), (second, rigid) = both
+    return [
+        (first, free, "m"),
+        *_relative(scaled, reference, "m", note),
+        (second, rigid, "arbitrary"),
+    ]
+
+
+def _relative(
+    estimate: np.ndarray, reference: np.ndarray, unit: str, note: Callable[[str], object]
+) -> list[tuple[str, ErrorStatistics, str]]:
     if not np.isfinite(reference[:, 2]).all():
-        if on_note is not None:
-            on_note("the truth has no headings; there is no relative error")
-        return [("absolute (ATE)", absolute, "m")]
+        note("the truth has no headings; there is no relative error")
+        return []
     relative = relative_pose_error(estimate, reference)
     return [
-        ("absolute (ATE)", absolute, "m"),
-        ("relative, per frame", relative.translation_m, "m"),
+        ("relative, per frame", relative.translation_m, unit),
         ("relative, per frame", relative.rotation_rad, "rad"),
     ]
+
+
+def _note_scale(
+    estimate: np.ndarray,
+    reference: np.ndarray,
+    rigid: ErrorStatistics,
+    note: Callable[[str], object],
+) -> None:
+    """Note a scale of the track that explains most of the error: one camera measures none."""
+    scale = align_tracks(estimate[:, :2], reference[:, :2], "similarity").scale
+    if scale <= 0.0 or abs(np.log(scale)) < np.log(_NOTED_SCALE):
+        return
+    free = absolute_trajectory_error(estimate[:, :2], reference[:, :2], "similarity")
+    if 2.0 * free.rmse < rigid.rmse:
+        note(
+            f"the truth is {scale:.4g} times as large as the track; with that scale the ATE is "
+            f"{free.rmse:.4f} m (--align similarity)"
+        )
 
 
 class MapComparison(NamedTuple):

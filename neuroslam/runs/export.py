@@ -29,7 +29,7 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
     - ``g2o``: a ``VERTEX_SE2`` for each experience, an ``EDGE_SE2`` for each link with its
       measurement :math:`(d \cos h,\; d \sin h,\; f)` of distance, heading and facing, and the
       information matrix :math:`\mathrm{diag}(\sigma_m^{-2}, \sigma_m^{-2}, \sigma_{rad}^{-2})`
-      of the config; vertex 0 is fixed.
+      of the config; vertex 0 is fixed, in the last line.
     - ``graphml``: a node for each experience with its pose, its view and its origin, a directed
       edge for each link with its measurements.
     - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
@@ -90,7 +90,6 @@ def _write_g2o(brain: NavigationBrain, to: Path) -> None:
     links, config = brain.map.links, brain.config.map
     vertices = np.column_stack([np.arange(brain.map.n), brain.map.poses]).tolist()
     lines = [f"VERTEX_SE2 {int(i)} {x!r} {y!r} {theta!r}" for i, x, y, theta in vertices]
-    lines.append("FIX 0")
     position, turn = config.sigma_m**-2, config.sigma_rad**-2
     dx, dy = (
         links.distance_m * np.cos(links.heading_rad),
@@ -101,6 +100,7 @@ def _write_g2o(brain: NavigationBrain, to: Path) -> None:
         f"EDGE_SE2 {i} {j} {x!r} {y!r} {facing!r} {position!r} 0 0 {position!r} 0 {turn!r}"
         for i, j, x, y, facing in zip(*(c.tolist() for c in columns), strict=True)
     ]
+    lines.append("FIX 0")  # last: some readers stop at it
     text = "\n".join(lines) + "\n"
     write_atomically(to, lambda file: file.write_text(text, encoding="ascii"))
 

@@ -53,6 +53,7 @@ class RunPlan:
     on_bad_frame: OnBadFrame = "stop"
     maps: tuple[str, ...] = ()
     truth: str = ""
+    axes: str = ""
 
     @property
     def name(self) -> str:
@@ -74,6 +75,8 @@ class RunPlan:
             lines.append(f"maps = {json.dumps(self.maps, ensure_ascii=False)}")
         if self.truth:
             lines.append(f"truth = {json.dumps(self.truth, ensure_ascii=False)}")
+        if self.axes:
+            lines.append(f"axes = {json.dumps(self.axes)}")
         return "\n".join(["\n[run]", *lines]) + "\n"
 
 

@@ -15,6 +15,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, counted
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import brain_file, write_text
+from neuroslam.runs.reading import length_unit
 from neuroslam.state.answers import counts_of, gathered
 from neuroslam.state.sessions import Session
 from neuroslam.state.tables import GrowingTable
@@ -42,6 +43,7 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
     status, config, log = file.stat(), brain.config, brain.sessions
     written = datetime.fromtimestamp(status.st_mtime, UTC)
     positions = brain.map.poses[:, :2]
+    unit = length_unit(file)
     width, height = np.ptp(positions, axis=0) if len(positions) else (0.0, 0.0)
     rows = [
         ("file", str(file)),
@@ -50,8 +52,8 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         ("size", f"{status.st_size} bytes"),
         ("written", f"{written:%Y-%m-%d %H:%M} UTC"),
         *_counts(brain),
-        ("extent", f"{width:.2f} m x {height:.2f} m"),
-        ("length of all links", f"{brain.map.links.distance_m.sum():.2f} m"),
+        ("extent", f"{width:.2f} {unit} x {height:.2f} {unit}"),
+        ("length of all links", f"{brain.map.links.distance_m.sum():.2f} {unit}"),
         ("frames seen", f"{sum(session.frames for session in log.sessions)}"),
         ("cells", "+".join(config.cells)),
         *(_views(config) if "pose" in config.cells else []),

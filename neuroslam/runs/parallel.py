@@ -17,11 +17,9 @@ from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any, TypeVar
 
-import cv2
-import torch
-
 from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
+from neuroslam.threads import limit_threads
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -91,21 +89,8 @@ def outcomes(
         yield from _in_processes(function, numbered, jobs)
 
 
-@contextlib.contextmanager
-def one_thread(n: int = 1) -> Iterator[None]:
-    """Limit torch and OpenCV to ``n`` threads; one is fastest for the small arrays of a brain."""
-    torch_threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(n)
-    cv2.setNumThreads(n)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(torch_threads)
-        cv2.setNumThreads(cv_threads)
-
-
 def _attempt(function: Callable[[T], R], item: T) -> R | NeuroslamError:
-    with one_thread():
+    with limit_threads():
         try:
             return function(item)
         except NeuroslamError as error:

@@ -11,6 +11,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import save
 from neuroslam.runs.files import brain_file, write_text
+from neuroslam.runs.reading import length_unit
 
 
 class PlannedPath(NamedTuple):
@@ -23,6 +24,7 @@ class PlannedPath(NamedTuple):
         beside_m: Distance from the position that was asked for to the last experience; 0 if an
             experience was asked for.
         files: ``plan.csv`` and ``plan.png``.
+        unit: Unit of the lengths: ``m``, or ``arbitrary unit`` for one camera alone.
     """
 
     path: list[int]
@@ -30,6 +32,7 @@ class PlannedPath(NamedTuple):
     duration_s: float
     beside_m: float
     files: list[Path]
+    unit: str = "m"
 
 
 def plan(
@@ -60,7 +63,7 @@ def plan(
     length_m = float(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
     rows = zip(found.path, poses.tolist(), strict=True)
     lines = [f"{k},{e},{x!r},{y!r},{t!r}" for k, (e, (x, y, t)) in enumerate(rows)]
-    links = brain.map.links
+    links, unit = brain.map.links, length_unit(file)
     figure = plot_map(
         brain.map.poses,
         np.column_stack([links.source, links.target]),
@@ -68,7 +71,8 @@ def plan(
         landmarks=brain.landmarks_m,
         planned=poses[:, :2],
         title=f"Path from experience {begin} to {end}\n"
-        f"{counted(len(found.path) - 1, 'link')}, {length_m:.1f} m, {found.duration_s:.1f} s",
+        f"{counted(len(found.path) - 1, 'link')}, {length_m:.1f} {unit}, {found.duration_s:.1f} s",
+        unit=unit,
     )
     files = [out / "plan.csv", out / "plan.png"]
     try:
@@ -77,7 +81,7 @@ def plan(
         save(figure, files[1])
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
-    return PlannedPath(found.path, length_m, found.duration_s, beside_m, files)
+    return PlannedPath(found.path, length_m, found.duration_s, beside_m, files, unit)
 
 
 def _experience(brain: NavigationBrain, text: str, what: str) -> tuple[int, float]:

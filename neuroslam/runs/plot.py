@@ -18,6 +18,7 @@ from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import plain_text, save, shortened
 from neuroslam.runs.files import RunPlan
 from neuroslam.runs.reading import (
+    length_unit,
     odometry_track,
     read_frames,
     read_plan,
@@ -45,7 +46,7 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
     trace, frames = read_trace(out, rows), read_frames(out, rows)
     try:
         to.mkdir(parents=True, exist_ok=True)
-        draw_map(brain, plan, trace, to / "map.png")
+        draw_map(brain, plan, trace, to / "map.png", length_unit(out))
         path = trajectory(brain, trace)[:, :2]
         figures: dict[str, Figure] = {}
         for kind, population in brain.populations.items():
@@ -89,7 +90,11 @@ _DRAWN: dict[str, Callable[[Any, np.ndarray], dict[str, Figure]]] = {
 
 
 def draw_map(
-    brain: NavigationBrain, plan: RunPlan, trace: dict[str, np.ndarray], path: Path
+    brain: NavigationBrain,
+    plan: RunPlan,
+    trace: dict[str, np.ndarray],
+    path: Path,
+    unit: str = "m",
 ) -> None:
     """Draw ``map.png`` of a run in the coordinates of its CSVs, one colour per session."""
     links, truth, log = brain.map.links, true_poses(trace), brain.sessions
@@ -112,6 +117,7 @@ def draw_map(
         session_names=names if several else (),
         odometry_of=whose if several else "",
         title=_title(brain, plan, on_map),
+        unit=unit,
     )
     save(figure, path)
 

@@ -214,6 +214,25 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     return metrics
 
 
+def length_unit(path: str | Path) -> str:
+    """Return the unit of lengths on the map of a run: ``arbitrary unit`` for one camera alone.
+
+    Args:
+        path: Folder of a run, or its brain file; elsewhere the unit is taken to be ``m``.
+    """
+    path = Path(path)
+    try:
+        metrics = read_metrics(path if path.is_dir() else path.parent)
+    except RunError:
+        return "m"
+    return unit_of(metrics.get("measured_motion"))
+
+
+def unit_of(measured: bool | None) -> str:
+    """Return the unit of lengths of a run with or without measured motion; ``None``: unknown."""
+    return "arbitrary unit" if measured is False else "m"
+
+
 def true_poses(trace: dict[str, np.ndarray]) -> np.ndarray | None:
     """Return the true pose of every frame, ``(frames, 3)``; ``None`` if none is known.
 

@@ -20,7 +20,15 @@ from neuroslam.runs.files import (
     write_text,
 )
 from neuroslam.runs.plot import draw_map
-from neuroslam.runs.reading import odometry_track, read_metrics, read_trace, trajectory, true_poses
+from neuroslam.runs.reading import (
+    odometry_track,
+    read_metrics,
+    read_trace,
+    trajectory,
+    true_poses,
+    unit_of,
+)
+from neuroslam.runs.sanity import is_animal, unit_warnings
 from neuroslam.state.answers import RUN_FIGURES, counts_of, gathered, tables_of
 
 
@@ -34,7 +42,10 @@ class RunSummary:
     cpu_seconds: float = 0.0
     skipped: list[str] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     pictures: bool = False
+    measured: bool | None = None
     interrupted: bool = False
     counts: dict[str, float] = field(default_factory=dict)
     accuracy: dict[str, float] = field(default_factory=dict)
@@ -44,6 +55,7 @@ class RunSummary:
     tables: list[str] = field(default_factory=list)
     unplaced: int = 0
     failure: str = ""
+    bad_frame: bool = False
 
     @property
     def cells(self) -> dict[str, float]:
@@ -67,7 +79,10 @@ class RunSummary:
             "skipped_frames": len(self.skipped),
             "skipped": self.skipped,
             "unused": self.unused,
+            "notes": self.notes,
+            "warnings": self.warnings,
             "pictures": self.pictures,
+            "measured_motion": self.measured,
             "tables": self.tables,
             "interrupted": self.interrupted,
             **self.accuracy,
@@ -107,6 +122,8 @@ def write_results(
         "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
     }
     summary.counts |= gathered(brain.populations.values(), counts_of)
+    if summary.measured:
+        summary.warnings = unit_warnings(trace, is_animal(plan.source, brain.config))
     tables = gathered(brain.populations.values(), tables_of)
     summary.tables = list(tables)
     if truth is not None:
@@ -119,11 +136,11 @@ def write_results(
                 ).rmse
                 for name, xy in (("ate", track), ("odometry_ate", odometry))
             }
-            if plan.truth:  # a lone camera has no metres: also with a free scale
+            if plan.truth or summary.measured is False:  # one camera has no metres: free scale
                 summary.accuracy["ate_similarity_rmse_m"] = absolute_trajectory_error(
                     track[known, :2], truth[known, :2], "similarity"
                 ).rmse
-                summary.accuracy["frames_with_truth"] = int(known.sum())
+            summary.accuracy["frames_with_truth"] = int(known.sum())
     try:
         # First what cannot be derived again, so that a run killed now can still be resumed.
         save_run(brain, plan, out, summary)
@@ -132,7 +149,7 @@ def write_results(
         for name, table in tables.items():
             write_text(out / name, table)
         write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
-        draw_map(brain, plan, trace, out / "map.png")
+        draw_map(brain, plan, trace, out / "map.png", unit_of(summary.measured))
     except OSError as error:
         raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
     return summary
@@ -156,5 +173,7 @@ def read_summary(out: Path) -> RunSummary:
         seconds=float(old["seconds"]),
         cpu_seconds=float(old["cpu_seconds"]),
         skipped=list(old["skipped"]),
+        notes=list(old.get("notes", ())),
         pictures=bool(old.get("pictures")),
+        measured=old.get("measured_motion"),
     )

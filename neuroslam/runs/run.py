@@ -23,16 +23,18 @@ from neuroslam.config import (
     read_preset,
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
+from neuroslam.runs.clocks import resolve_offset
 from neuroslam.runs.files import OnBadFrame, RowWriter, RunPlan, brain_file, require_free
-from neuroslam.runs.parallel import one_thread
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
 from neuroslam.runs.truth import WithTruth
 from neuroslam.sensors import Source, open_source
+from neuroslam.sensors.axes import parse_axes
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.threads import limit_threads
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -87,6 +89,8 @@ def run(
     maps: Sequence[str | Path] = (),
     landmarks: str | Path | None = None,
     truth: str | Path | None = None,
+    axes: str | None = None,
+    offset: str | float | None = None,
     preset: str = "",
     start: int = 0,
     stop: int | None = None,
@@ -110,6 +114,10 @@ def run(
             has. They are stored in the brain.
         truth: File of true positions, see :func:`~neuroslam.runs.truth.read_truth`, for figures and
             errors; the brain never sees it. It replaces what the source knows.
+        axes: Axes of the ground plane in ``truth``, see
+            :func:`~neuroslam.sensors.axes.parse_axes`; default: x and y.
+        offset: Seconds to add to the times of the motion of a source ``VIDEO+MOTION.csv``; ``auto``
+            finds them by the turn rates, see :func:`~neuroslam.runs.clocks.resolve_offset`.
         preset: Name of the preset of the config, stored with the session.
         start: First frame of the source.
         stop: Frame to stop before; default: the end.
@@ -139,7 +147,11 @@ def run(
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
     paths = tuple(_absolute(brain_file(path)) for path in maps)
     true_file = "" if truth is None else str(Path(truth).resolve())
-    plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths, true_file)
+    if axes is not None:
+        if truth is None:
+            raise RunError(f"--axes {axes}: are those of a file of truth; give --truth FILE too")
+        parse_axes(axes)
+    plan = RunPlan(_absolute(source), start, stop, on_bad_frame, paths, true_file, axes or "")
     require_free(out, plan.source, overwrite)
     if any(Path(path).parent == out.resolve() for path in paths):
         raise RunError(
@@ -148,19 +160,22 @@ def run(
     words = () if landmarks is None else read_landmarks(landmarks)
     stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
     config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
+    source, told = resolve_offset(str(source), offset, config)
+    plan = replace(plan, source=_absolute(source))
     opened = _opened(source, plan, config)
     if opened.n_frames is not None and start >= opened.n_frames:
         raise RunError(
             f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
         )
-    brain, summary = NavigationBrain(config, features=features), RunSummary()
+    brain = NavigationBrain(config, features=features)
+    summary = RunSummary(notes=[*told, *opened.notes])
     brain.about = (plan.name, preset, recorded(plan.source))
     _name_landmarks(brain, opened, words)
     for one in stored:
         brain.store(one)
     _announce(on_start, stop, opened)
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -175,13 +190,14 @@ def run(
                 brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
             )
         summary.unused = list(opened.unused)
+        summary.notes += [note for note in opened.notes if note not in summary.notes]
         return write_results(brain, plan, out, summary)
 
 
 def _opened(source: str | Path, plan: RunPlan, config: BrainConfig) -> Source:
     """Open the source of a run, with the truth of its file, if it has one."""
     opened = open_source(source, config.frame_rate_hz, config.view.grey)
-    return WithTruth(opened, plan.truth) if plan.truth else opened
+    return WithTruth(opened, plan.truth, plan.axes or None) if plan.truth else opened
 
 
 def _name_landmarks(
@@ -236,7 +252,7 @@ def resume(
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
     with (
-        one_thread(brain.config.threads),
+        limit_threads(brain.config.threads),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -246,6 +262,7 @@ def resume(
             save = _saver(brain, plan, out, summary, output, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, interrupts, save)
         summary.unused = list(opened.unused)
+        summary.notes += [note for note in opened.notes if note not in summary.notes]
         return write_results(brain, plan, out, summary)
 
 
@@ -270,6 +287,8 @@ def _steps(
             skip(error)
         else:
             summary.pictures |= frame.image is not None
+            measured = frame.velocity is not None and brain.config.odometry.use != "visual"
+            summary.measured = bool(summary.measured) or measured
             yield frame, result
 
 
@@ -305,7 +324,7 @@ def _drive(
     except (SourceError, MapError) as error:
         if brain.half_taken:  # no state to write: what was saved before is kept
             raise RunError(f"{error}; the map is not written: {brain.half_taken}") from error
-        summary.failure = str(error)
+        summary.failure, summary.bad_frame = str(error), isinstance(error, BadFrame)
     summary.interrupted = bool(interrupts)
     # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))

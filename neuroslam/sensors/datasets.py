@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, counted
 from neuroslam.geometry import wrap_angles
+from neuroslam.sensors.axes import axes_note, rotate
 from neuroslam.sensors.images import (
     ImageFile,
     ImageSource,
@@ -28,10 +29,17 @@ from neuroslam.sensors.images import (
     parse_times,
     read_text,
 )
+from neuroslam.sensors.times import in_seconds, unit_note
 from neuroslam.types import GreyRule
 
 MAX_GAP_S = 0.1
-"""An image farther in time than this from every known pose has no truth."""
+"""An image as far in time as this from every known pose has no truth."""
+
+_MAX_BEYOND_S = 0.02
+"""An image farther than this before the first known pose or after the last has no truth."""
+
+_ROUNDING_S = 1e-6
+"""Unix times in s differ by less than this through rounding."""
 
 _KITTI_CAMERAS = ("image_2", "image_0", "image_3", "image_1")
 
@@ -60,18 +68,32 @@ def open_tum(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Image
     """
     images = open_image_list(path / "rgb.txt", frame_rate_hz)
     times, truth = images.clock.times_s, None
-    if (path / "groundtruth.txt").is_file():
+    notes = list(images.notes)
+    truth_file = path / "groundtruth.txt"
+    if truth_file.is_file():
         if times is None:
             raise SourceError(
                 f"{path / 'rgb.txt'}: has no times; expected lines 'time_s path', as the poses of "
                 "groundtruth.txt are assigned by time"
             )
-        rows = _table(path / "groundtruth.txt", 8)
-        forward = _rotated(rows[:, 4:8], np.array([0.0, 0.0, 1.0]))
+        rows = _table(truth_file, 8, notes)
+        known_s, unit = in_seconds(rows[:, 0], "s")
+        if unit != "s":
+            notes.append(unit_note(str(truth_file), "s", unit))
+        forward = rotate(rows[:, 4:8], np.array([0.0, 0.0, 1.0]))
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
-        truth = at_times(rows[:, 0], poses, times)
+        truth = at_times(known_s, poses, times)
+        option = f"run with --truth {truth_file} --axes camera"
+        if note := axes_note(str(truth_file), rows[:, 1:4], option):
+            notes.append(note)
     return ImageSource(
-        str(path), images.images, times, images.clock.frame_rate_hz, truth=truth, grey=grey
+        str(path),
+        images.images,
+        times,
+        images.clock.frame_rate_hz,
+        truth=truth,
+        grey=grey,
+        notes=tuple(notes),
     )
 
 
@@ -86,12 +108,14 @@ def open_kitti(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Ima
     if not names:
         raise SourceError(f"{folder}: contains no images; expected files like 000000.png")
     times_file = path / "times.txt"
-    times = parse_times(read_text(times_file), str(times_file)) if times_file.is_file() else None
-    truth = None
+    times, truth, notes = None, None, []
+    if times_file.is_file():
+        times, told = parse_times(read_text(times_file), str(times_file))
+        notes += told
     numbered = path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt"
     for poses_file in (path / "poses.txt", numbered):
         if poses_file.is_file():
-            rows = _table(poses_file, 12)
+            rows = _table(poses_file, 12, notes, keep=len(names))
             if len(rows) != len(names):
                 raise SourceError(
                     f"{poses_file}: {len(rows)} poses for {len(names)} images; expected one each"
@@ -99,7 +123,9 @@ def open_kitti(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Ima
             truth = _on_ground(rows[:, 11], -rows[:, 3], rows[:, 10], -rows[:, 2])
             break
     images = [ImageFile(name, folder / name) for name in names]
-    return ImageSource(str(path), images, times, frame_rate_hz, truth=truth, grey=grey)
+    return ImageSource(
+        str(path), images, times, frame_rate_hz, truth=truth, grey=grey, notes=tuple(notes)
+    )
 
 
 def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
@@ -112,7 +138,7 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
     lines = [line.split(",") for line in read_text(camera / "data.csv").splitlines()]
     lines = [line for line in lines if line[0].strip() and not line[0].startswith("#")]
     try:
-        times = np.array([int(line[0]) for line in lines]) * 1e-9
+        times = np.array([int(line[0]) for line in lines]) / 1e9
         names = [line[1].strip() for line in lines]
     except (ValueError, IndexError):
         raise SourceError(
@@ -121,15 +147,17 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
     if not names:
         raise SourceError(f"{camera / 'data.csv'}: lists no images; expected one per line")
     images = [ImageFile(name, camera / "data" / name) for name in names]
-    truth = None
+    truth, notes = None, []
     truth_file = mav / "state_groundtruth_estimate0" / "data.csv"
     if truth_file.is_file():
-        rows = _table(truth_file, 8, ",")
+        rows = _table(truth_file, 8, notes, ",")
         axis = _optical_axis(camera / "sensor.yaml")
-        forward = _rotated(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
+        forward = rotate(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
-        truth = at_times(rows[:, 0] * 1e-9, poses, times)
-    return ImageSource(str(mav.parent), images, times, frame_rate_hz, truth=truth, grey=grey)
+        truth = at_times(rows[:, 0] / 1e9, poses, times)
+    return ImageSource(
+        str(mav.parent), images, times, frame_rate_hz, truth=truth, grey=grey, notes=tuple(notes)
+    )
 
 
 def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray) -> np.ndarray:
@@ -141,50 +169,101 @@ def at_times(known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray) -> np.
         times_s: Times at which poses are needed, ``(m,)``.
 
     Returns:
-        Poses ``(m, 3)``, NaN where no pose is known within ``MAX_GAP_S``.
+        Poses ``(m, 3)``, NaN where no pose is known within less than ``MAX_GAP_S``, or, before the
+        first known pose and after the last, within 0.02 s. A row that is not finite is unknown.
 
     Example:
         >>> poses = np.array([[0.0, 0.0, 3.0], [1.0, 0.0, -3.2]])
         >>> at_times(np.array([0.0, 0.1]), poses, np.array([0.05, 9.0])).round(3).tolist()
         [[0.5, 0.0, 3.042], [nan, nan, nan]]
     """
+    known = np.isfinite(known_s) & np.isfinite(poses[:, :2]).all(axis=1)
+    headed = known & np.isfinite(poses[:, 2])
     order = np.argsort(known_s, kind="stable")
-    known_s, poses = known_s[order], poses[order]
-    unwrapped = np.unwrap(poses[:, 2])
-    found = np.column_stack(
-        [np.interp(times_s, known_s, column) for column in (poses[:, 0], poses[:, 1], unwrapped)]
+    known, headed = order[known[order]], order[headed[order]]
+    xy = _interpolated(known_s[known], poses[known, :2], times_s)
+    heading = _interpolated(known_s[headed], np.unwrap(poses[headed, 2])[:, None], times_s)
+    return np.column_stack([xy, wrap_angles(heading)])
+
+
+def _interpolated(known_s: np.ndarray, values: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Interpolate values ``(n, c)`` at rising times; NaN where none is known near enough."""
+    if not len(known_s):
+        return np.full((len(times_s), values.shape[1]), np.nan)
+    found = np.column_stack([np.interp(times_s, known_s, column) for column in values.T])
+    after = np.searchsorted(known_s, times_s)
+    since = np.where(after > 0, times_s - known_s[after - 1], np.inf)
+    until = np.where(
+        after < len(known_s), known_s[after.clip(max=len(known_s) - 1)] - times_s, np.inf
     )
-    found[:, 2] = wrap_angles(found[:, 2])
-    after = np.searchsorted(known_s, times_s).clip(1, len(known_s) - 1) if len(known_s) > 1 else 0
-    gaps = np.minimum(np.abs(known_s[after] - times_s), np.abs(known_s[after - 1] - times_s))
-    found[gaps > MAX_GAP_S] = np.nan
+    gap = np.minimum(since, until)
+    inside = np.isfinite(since) & np.isfinite(until) & (gap < MAX_GAP_S - _ROUNDING_S)
+    found[~(inside | (gap <= _MAX_BEYOND_S + _ROUNDING_S))] = np.nan
     return found
 
 
-def _table(path: Path, columns: int, separator: str | None = None) -> np.ndarray:
-    """Read the first columns of a table of numbers; lines that start with ``#`` are comments."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
+def _table(
+    path: Path,
+    columns: int,
+    notes: list[str],
+    separator: str | None = None,
+    keep: int | None = None,
+) -> np.ndarray:
+    """Read the first columns of a table of numbers; lines that start with ``#`` are comments.
+
+    A line that cannot be read, is not finite, or has a quaternion of length 0 costs its row; the
+    notes count them.
+
+    Args:
+        path: The file.
+        columns: Number of columns to read.
+        notes: Receives a note on the lines that cannot be used.
+        separator: Separator of the columns; ``None``: blanks.
+        keep: Number of rows expected, one for each image: an unusable row is NaN then.
+
+    Raises:
+        SourceError: If half of the lines or more cannot be used.
+    """
+    lines = [
+        (number, line)
+        for number, line in enumerate(read_text(path).rstrip().splitlines(), start=1)
+        if not line.lstrip().startswith("#")
+    ]
+    if keep is None or len(lines) != keep:
+        lines = [(number, line) for number, line in lines if line.strip()]
+    rows, faults = [], []
+    for number, line in lines:
         try:
             row = [float(word) for word in line.split(separator)[:columns]]
         except ValueError:
             row = []
-        if len(row) < columns:
-            raise SourceError(f"{path}: line {number} is {line[:40]!r}; expected {columns} numbers")
+        is_lost = columns == 8 and not any(row[4:8])  # a quaternion of length 0
+        if len(row) < columns or is_lost or not np.isfinite(row).all():
+            faults.append(f"line {number} is {line[:40]!r}; expected {columns} numbers")
+            row = [np.nan] * columns
         rows.append(row)
     if not rows:
         raise SourceError(f"{path}: contains no poses; expected {columns} numbers per line")
-    return np.array(rows)
+    if 2 * len(faults) >= len(rows):
+        raise SourceError(f"{path}: {faults[0]}")
+    if faults:
+        notes.append(lost_rows(str(path), faults, len(rows)))
+    table = np.array(rows)
+    return table if keep is not None else table[np.isfinite(table).all(axis=1)]
 
 
-def _rotated(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate a vector by quaternions x, y, z, w, ``(n, 4)``, of any length."""
-    q = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    axis, w = q[:, :3], q[:, 3:]
-    across = np.cross(axis, vector)
-    return np.asarray(vector + 2.0 * (w * across + np.cross(axis, across)))
+def lost_rows(name: str, faults: list[str], n_rows: int) -> str:
+    """Return a note on the rows of a truth that cannot be used.
+
+    Example:
+        >>> lost_rows("truth.tum", ["line 7: got 3 numbers"], 60)
+        'truth.tum: 1 of 60 rows has no usable pose, the first: line 7: got 3 numbers'
+    """
+    have = "has" if len(faults) == 1 else "have"
+    return (
+        f"{name}: {len(faults)} of {counted(n_rows, 'row')} {have} no usable pose, "
+        f"the first: {faults[0]}"
+    )
 
 
 def _on_ground(

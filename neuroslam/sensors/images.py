@@ -1,9 +1,11 @@
 """Sources of images: a folder, a tar, or an image list; with times and motion if there are any.
 
 A folder or a tar (also ``.tar.gz``, ``.tar.bz2``, ``.tar.xz``) contains images in the natural order
-of their names (2.jpg before 10.jpg). It may contain ``times.txt`` or ``times.csv``, one time in
-seconds per line, and ``odometry.csv``, a motion CSV (:mod:`neuroslam.sensors.tracks`), each with
-one line per image.
+of their names (2.jpg before 10.jpg); names that are times, as ``str(time.time())`` writes them, are
+in the order of time. It may contain ``times.txt`` or ``times.csv``, one time in seconds per line
+(also ms, us or ns, :mod:`neuroslam.sensors.times`), and ``odometry.csv``, a motion CSV
+(:mod:`neuroslam.sensors.tracks`), each with one line per image. Without either, names that are Unix
+times are the times of the images.
 
 An image list is a text or CSV file whose lines are ``time_s path`` or ``path time_s``, separated by
 a comma or blanks, or the path alone. Paths are relative to the list; a header line and lines that
@@ -15,7 +17,7 @@ import re
 import tarfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,8 +26,18 @@ import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.grey import to_grey
+from neuroslam.sensors.pixels import PixelScale, spread
 from neuroslam.sensors.source import IndexedSource
-from neuroslam.sensors.tracks import Clock, Track, parse_motion
+from neuroslam.sensors.times import (
+    UNIT_NAMES,
+    Unit,
+    decimal_names,
+    in_seconds,
+    time_column,
+    times_of_names,
+    unit_note,
+)
+from neuroslam.sensors.tracks import SLOWEST_S, Clock, Track, parse_motion
 from neuroslam.types import Frame, GreyRule, Pose
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -62,6 +74,7 @@ class ImageSource(IndexedSource):
         motion: Measured motion, one row per image.
         truth: True poses, ``(n, 3)``, NaN where unknown; ``None``: those of the motion, if any.
         grey: How colour becomes grey.
+        notes: How the times or the truth were read, one line each.
 
     Raises:
         SourceError: If no image can be decoded, or the number of times or of motions differs from
@@ -77,20 +90,31 @@ class ImageSource(IndexedSource):
         motion: Track | None = None,
         truth: np.ndarray | None = None,
         grey: GreyRule = "luma",
+        notes: tuple[str, ...] = (),
     ) -> None:
         self.name = name
         self.grey: GreyRule = grey
+        self.notes = notes
         self.truth = truth if truth is not None or motion is None else motion.truth
         self.images = images
         self.n_frames = len(images)
         self.motion = motion
         if motion is not None:
             self._require_one_each(len(motion.velocities), f"lines of motion in {motion.name}")
+            self.notes += motion.notes
             times_s = motion.times_s if times_s is None else times_s
+        if times_s is None and (stamped := times_of_names([_stem(i.name) for i in images])):
+            times_s, unit = stamped
+            self.notes += (
+                f"{name}: the names of the images are their times, in {UNIT_NAMES[unit]}",
+            )
         if times_s is not None:
             self._require_one_each(len(times_s), "times")
         self.clock = Clock(name, times_s, frame_rate_hz)
+        self.notes += self.clock.notes
         self.frame_rate_hz = self.clock.frame_rate_hz
+        self.scale: PixelScale | None = None  # of images of more than 8 bits, once there is one
+        self._scale_note = ""
         self.image_shape = self._first_shape()
 
     def frame(self, index: int) -> Frame:
@@ -104,16 +128,35 @@ class ImageSource(IndexedSource):
         return Frame(index, time_s, image=image, velocity=velocity, truth=truth)
 
     def _decoded(self, index: int) -> np.ndarray:
+        pixels = self._pixels(index)
+        if pixels.dtype == np.uint8:
+            return to_grey(pixels, self.grey, "bgr")
+        self.scale = self.scale or self._scale_of_all()
+        try:
+            image = to_grey(self.scale(pixels, index), self.grey, "bgr")
+        except BadFrame as error:
+            raise BadFrame(
+                f"{self.name}: frame {index}: {self.images[index].name}: {error}"
+            ) from None
+        note, before = self.scale.note(), self._scale_note
+        if note != before:
+            told = f"{self.name}: "
+            kept = tuple(line for line in self.notes if not before or line != told + before)
+            self.notes, self._scale_note = (*kept, told + note), note
+        return image
+
+    def _pixels(self, index: int) -> np.ndarray:
+        """Return a decoded image with the bits that it has."""
         file = self.images[index]
         try:
-            image = decode_grey(file.read(), self.grey)
+            pixels = decode(file.read())
         except OSError as error:
             raise BadFrame(
                 f"{self.name}: frame {index}: {file.name} cannot be read ({error.strerror})"
             ) from None
-        if image is None:
+        if pixels is None:
             raise BadFrame(f"{self.name}: frame {index}: {file.name} is corrupt or not an image")
-        return image
+        return pixels
 
     def _first_shape(self) -> tuple[int, ...]:
         first_fault = None
@@ -124,6 +167,15 @@ class ImageSource(IndexedSource):
                 first_fault = first_fault or fault
         others = f"; and so are all {self.n_frames} frames" if self.n_frames > 1 else ""
         raise SourceError(f"{first_fault}{others}") from None
+
+    def _scale_of_all(self) -> PixelScale:
+        examined = []
+        for index in spread(self.n_frames):
+            with suppress(BadFrame):  # reported when it is read
+                pixels = self._pixels(index)
+                if pixels.dtype == np.uint16:
+                    examined.append(pixels)
+        return PixelScale.of(examined)
 
     def _require_one_each(self, n: int, what: str) -> None:
         if n != self.n_frames:
@@ -149,24 +201,52 @@ def require_shape(
         )
 
 
-def decode_grey(data: bytes, rule: GreyRule = "luma") -> np.ndarray | None:
+def decode_grey(
+    data: bytes, rule: GreyRule = "luma", scale: PixelScale | None = None, index: int = 0
+) -> np.ndarray | None:
     """Decode an image to grey by way of colour, as a JPEG's own luminance is rounded differently.
+
+    Args:
+        data: Encoded image.
+        rule: How colour becomes grey.
+        scale: Scale of images of more than 8 bits; default: what this image needs.
+        index: Number of the image in its source.
 
     Returns:
         ``uint8``, ``(h, w)``, or ``None`` if the bytes are not a complete image.
+
+    Raises:
+        BadFrame: If the pixels are neither of 8 nor of 16 bits.
 
     Example:
         >>> decode_grey(cv2.imencode(".png", np.full((2, 3), 7, np.uint8))[1].tobytes()).tolist()
         [[7, 7, 7], [7, 7, 7]]
     """
+    pixels = decode(data)
+    if pixels is None:
+        return None
+    scale = PixelScale.of([pixels]) if scale is None else scale
+    return to_grey(scale(pixels, index), rule, "bgr")
+
+
+def decode(data: bytes) -> np.ndarray | None:
+    """Decode an image with the bits that it has.
+
+    Returns:
+        ``(h, w, 3)`` BGR, ``uint8``, ``uint16`` or of the type of the file, or ``None`` if the
+        bytes are not a complete image.
+    """
     if not data or not _is_complete(data):
         return None
     with quiet_opencv():
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:
-            return None
-    return None if image is None else to_grey(image, rule, "bgr")
+        for flags in (cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, cv2.IMREAD_UNCHANGED):
+            try:
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            except cv2.error:
+                return None
+            if image is not None:  # some types, such as float32, are decoded unchanged only
+                return image
+    return None
 
 
 def _is_complete(data: bytes) -> bool:
@@ -263,8 +343,25 @@ def open_image_list(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -
         raise SourceError(
             f"{path}: {without} has no time, but others do; expected a time for all or none"
         )
-    known = None if None in times else np.array(times)
-    return ImageSource(str(path), images, known, frame_rate_hz, grey=grey)
+    known, notes = None, ()
+    if None not in times:
+        known, notes = _in_seconds(np.array(times), _stated_unit(read_text(path)), str(path))
+    return ImageSource(str(path), images, known, frame_rate_hz, grey=grey, notes=notes)
+
+
+def _stated_unit(text: str) -> Unit | None:
+    """Return the unit that the first line of a list or of times states, if it is a header."""
+    line = text.lstrip().partition("\n")[0]
+    column = time_column(line.split(",") if "," in line or "[" in line else line.split())
+    return None if column is None else column.unit
+
+
+def _in_seconds(
+    times: np.ndarray, stated: Unit | None, name: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Convert times that are in seconds unless stated or shown otherwise; note what is not."""
+    times_s, unit = in_seconds(times, stated, SLOWEST_S)
+    return times_s, () if unit == "s" else (unit_note(name, stated, unit),)
 
 
 def parse_image_list(text: str, name: str) -> list[tuple[str, float | None]]:
@@ -310,25 +407,29 @@ def _time(text: str) -> float | None:
         return None
 
 
-def parse_times(text: str, name: str) -> np.ndarray:
-    r"""Read one time in seconds per line; a header and lines that start with ``#`` are skipped.
+def parse_times(text: str, name: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    r"""Read one time per line; a header and lines that start with ``#`` are skipped.
+
+    Returns:
+        Times in seconds, ``(n,)``; a note if they are not in seconds.
 
     Raises:
         SourceError: If a line is not a number.
 
     Example:
-        >>> parse_times("time_s\n0.0\n0.5\n", "times.csv").tolist()
+        >>> parse_times("time_s\n0.0\n0.5\n", "times.csv")[0].tolist()
         [0.0, 0.5]
     """
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    if lines and lines[0][1].strip('"').isidentifier() and _time(lines[0][1]) is None:
-        del lines[0]
+    header = lines[0][1].strip('"') if lines else ""
+    if _time(header) is None and (header.isidentifier() or time_column([header])):
+        del lines[:1]
     times = [_time(line) for _, line in lines]
     if None in times:
         number, line = lines[times.index(None)]
         raise SourceError(f"{name}: line {number} is {line[:40]!r}; expected a time in seconds")
-    return np.array(times, dtype=np.float64)
+    return _in_seconds(np.array(times, dtype=np.float64), _stated_unit(text), name)
 
 
 _NOTES = ("times.txt", "times.csv", "odometry.csv")
@@ -345,16 +446,35 @@ def _with_notes(
         raise SourceError(
             f"{name}: contains no images; expected files like 000000{IMAGE_SUFFIXES[0]}"
         )
-    times = next((note for note in ("times.txt", "times.csv") if note in notes), None)
+    file = next((note for note in ("times.txt", "times.csv") if note in notes), None)
+    times_s, told = None, ()
+    if file is not None:
+        times_s, told = parse_times(notes[file], f"{name}: {file}")
     motion = notes.get("odometry.csv")
     return ImageSource(
         name,
-        sorted(images, key=lambda image: natural_key(image.name)),
-        None if times is None else parse_times(notes[times], f"{name}: {times}"),
+        in_order(images),
+        times_s,
         frame_rate_hz,
         None if motion is None else parse_motion(motion, f"{name}: odometry.csv"),
         grey=grey,
+        notes=told,
     )
+
+
+def in_order(images: list[ImageFile]) -> list[ImageFile]:
+    """Sort images by name: decimal numbers by value, see :func:`decimal_names`, else naturally."""
+    numbers = decimal_names([_stem(image.name) for image in images])
+    folders = {image.name.rpartition("/")[0] for image in images}
+    if numbers is None or len(folders) > 1:
+        return sorted(images, key=lambda image: natural_key(image.name))
+    order = sorted(range(len(images)), key=lambda k: (numbers[k], images[k].name))
+    return [images[k] for k in order]
+
+
+def _stem(name: str) -> str:
+    """Return a file name without its folder and suffix."""
+    return name.rpartition("/")[2].rpartition(".")[0]
 
 
 def is_image_name(name: str) -> bool:
@@ -363,15 +483,20 @@ def is_image_name(name: str) -> bool:
     return base.lower().endswith(IMAGE_SUFFIXES) and not base.startswith(".")
 
 
-def natural_key(name: str) -> tuple[list[int | str], str]:
-    """Return a sort key that compares the numbers in names as numbers.
+def natural_key(name: str) -> tuple[list[float | str], str]:
+    """Return a sort key that compares the numbers in names as numbers, Unix times as decimals.
 
     Example:
         >>> sorted(["10.jpg", "2.jpg", "a.jpg"], key=natural_key)
         ['2.jpg', '10.jpg', 'a.jpg']
+        >>> sorted(["map.jpg", "1700000000.5.jpg", "1700000000.25.jpg"], key=natural_key)
+        ['1700000000.25.jpg', '1700000000.5.jpg', 'map.jpg']
     """
-    parts = re.split(r"(\d+)", name)
-    return [int(part) if part.isdecimal() else part.lower() for part in parts], name
+    parts = re.split(r"(\d{9,10}\.\d+|\d+)", name)
+    numbers = [float(part) if "." in part else int(part) for part in parts[1::2]]
+    key: list[float | str] = [part.lower() for part in parts]
+    key[1::2] = numbers
+    return key, name
 
 
 def read_text(path: Path) -> str:

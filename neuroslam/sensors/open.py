@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,6 +31,7 @@ _KINDS = (
     "a TUM, KITTI or EuRoC folder, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
     "motion as drive.avi+motion.csv"
 )
+_OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
 _PREFIXES = ("world:", "arena:", "camera:")
 
 
@@ -52,7 +54,8 @@ def open_source(
     ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)
     ``arena:NAME``, ``arena:rat.npz``   walk with noisy senses (:mod:`neuroslam.worlds.senses`)
     ``drive.avi+motion.csv``            two sources merged by time: a camera and motion
-                                        (:mod:`neuroslam.sensors.streams`)
+                                        (:mod:`neuroslam.sensors.streams`); with ``?offset=S``, S
+                                        seconds are added to the times of the motion
     ==================================  ========================================================
 
     Args:
@@ -74,8 +77,11 @@ def open_source(
     if spec == "":  # as a path it would name the working folder
         raise SourceError(f"the name of the source is empty; expected {_KINDS}")
     try:
-        if parts := _parts(str(spec)):
-            return Streams(*(open_source(part, frame_rate_hz, grey) for part in parts))
+        pair, offset = split_offset(str(spec))
+        if parts := _parts(pair):
+            offset_s = _offset_s(pair, offset)
+            first, second = (open_source(part, frame_rate_hz, grey) for part in parts)
+            return Streams(first, second, offset_s)
         if isinstance(spec, str) and spec.startswith("world:"):
             from neuroslam.worlds.world import open_world  # here: worlds import this package
 
@@ -99,6 +105,56 @@ def open_source(
         raise SourceError(f"{spec}: cannot be read ({error.strerror or error})") from None
 
 
+def split_offset(spec: str) -> tuple[str, str]:
+    """Split the offset of the clocks from the name of two sources; empty if there is none.
+
+    Example:
+        >>> split_offset("drive.mp4+motion.csv?offset=-3.5")
+        ('drive.mp4+motion.csv', '-3.5')
+    """
+    match = _OFFSET.fullmatch(spec)
+    if match is None or "+" not in match[1] or Path(spec).exists():
+        return spec, ""
+    return match[1], match[2]
+
+
+def with_offset(spec: str, offset: str | float) -> str:
+    """Return the name of two sources with an offset of their clocks.
+
+    Raises:
+        SourceError: If the name is not that of two sources, or has an offset already.
+
+    Example:
+        >>> with_offset("world:ring+motion.csv", 2.0)  # doctest: +SKIP
+        'world:ring+motion.csv?offset=2.0'
+    """
+    pair, before = split_offset(spec)
+    if before:
+        raise SourceError(f"{spec}: has an offset already; leave out one of the two")
+    if _parts(spec) is None:
+        raise SourceError(
+            f"{spec}: an offset is between the clocks of two sources; expected a camera and motion "
+            "as drive.avi+motion.csv"
+        )
+    return f"{pair}{'&' if '?' in pair.rpartition('+')[2] else '?'}offset={offset}"
+
+
+def pair_of(spec: str) -> tuple[str, str] | None:
+    """Return the names of the two sources that a name joins by ``+``, or ``None``."""
+    return _parts(split_offset(spec)[0])
+
+
+def _offset_s(pair: str, offset: str) -> float:
+    try:
+        offset_s = float(offset or 0.0)
+    except ValueError:
+        offset_s = math.nan
+    if not math.isfinite(offset_s):
+        hint = "; neuroslam.runs.clocks.resolve_offset finds 'auto'" if offset == "auto" else ""
+        raise SourceError(f"{pair}: offset is {offset!r}; expected a number of seconds{hint}")
+    return offset_s
+
+
 def _bag_topics(spec: str) -> tuple[Path, dict[str, str]]:
     """Split ``drive.bag?image=/front`` into the path and the topics."""
     name, mark, query = spec.partition("?")
@@ -115,8 +171,10 @@ def absolute_spec(spec: str) -> str:
         >>> absolute_spec("world:town?laps=2"), absolute_spec("arena:square")
         ('world:town?laps=2', 'arena:square')
     """
-    if parts := _parts(spec):
-        return "+".join(map(absolute_spec, parts))
+    pair, offset = split_offset(spec)
+    if parts := _parts(pair):
+        whole = "+".join(map(absolute_spec, parts))
+        return with_offset(whole, offset) if offset else whole
     if spec.startswith("arena:"):
         name, mark, query = spec.removeprefix("arena:").partition("?")
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
@@ -139,8 +197,10 @@ def seeded_spec(spec: str, seed: int) -> str:
         >>> seeded_spec("world:town?laps=2", 7), seeded_spec("drive.avi", 7)
         ('world:town?laps=2&seed=7', 'drive.avi')
     """
-    if parts := _parts(spec):
-        return "+".join(seeded_spec(part, seed) for part in parts)
+    pair, offset = split_offset(spec)
+    if parts := _parts(pair):
+        whole = "+".join(seeded_spec(part, seed) for part in parts)
+        return with_offset(whole, offset) if offset else whole
     if not spec.startswith(_PREFIXES):
         return spec
     name, _, query = spec.partition("?")

@@ -1,7 +1,10 @@
 """ROS 1 and ROS 2 bags: camera, wheel odometry, laser scanner; needs the extra ``rosbag``.
 
-``drive.bag``, a ``.db3`` or ``.mcap`` file, or a folder with ``metadata.yaml``. The first topic of
-each kind is read, or the one named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``.
+``drive.bag``, a ``.db3`` or ``.mcap`` file, or a folder with ``metadata.yaml``. One topic of each
+kind is read, chosen by type, content and name (:mod:`neuroslam.sensors.bag_topics`), or the one
+named: ``drive.bag?image=/front&odometry=/wheels&scan=/laser``. ``notes`` of the source lists the
+topics and the choice. Motion is the twist of the odometry, or the change of its poses where the
+twist does not agree with them; ``motion=twist`` or ``motion=poses`` decides otherwise.
 """
 
 from abc import abstractmethod
@@ -10,59 +13,33 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError, did_you_mean
+from neuroslam.errors import BadFrame, NeuroslamError, SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI, wrap_angles
-from neuroslam.sensors.grey import to_grey
-from neuroslam.sensors.images import decode_grey, require_shape
+from neuroslam.sensors.bag_images import grey_of
+from neuroslam.sensors.bag_odometry import OdometrySample, motion_between, odometry_sample
+from neuroslam.sensors.bag_topics import (
+    KINDS,
+    Candidate,
+    candidates,
+    choose,
+    messages_of,
+    note_of,
+    time_of,
+)
+from neuroslam.sensors.images import require_shape
+from neuroslam.sensors.pixels import PixelScale
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import time_text
 from neuroslam.types import Frame, GreyRule, Velocity
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
-KINDS = {
-    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    "odometry": ("nav_msgs/msg/Odometry",),
-    "scan": ("sensor_msgs/msg/LaserScan",),
-}
 N_RANGES = 360
 """Number of bearings to which a scan is resampled, evenly over the full turn."""
 
-_GREY = {
-    "mono8": (np.uint8, 1, None),
-    "8UC1": (np.uint8, 1, None),
-    "mono16": (np.uint16, 1, None),
-    "16UC1": (np.uint16, 1, None),
-    "bgr8": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
-    "8UC3": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
-    "rgb8": (np.uint8, 3, cv2.COLOR_RGB2GRAY),
-    "bgra8": (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
-    "8UC4": (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
-    "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2GRAY),
-    "yuv422": (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": (np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2),
-    "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerBG2GRAY),
-    "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerRG2GRAY),
-    "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
-    "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
-}
-"""For each encoding: type and number of channels of a pixel, and its conversion to luma."""
-
-_BGR = {
-    "bgra8": cv2.COLOR_BGRA2BGR,
-    "8UC4": cv2.COLOR_BGRA2BGR,
-    "rgba8": cv2.COLOR_RGBA2BGR,
-    "yuv422": cv2.COLOR_YUV2BGR_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
-    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
-}
-"""Conversion of an encoding to three channels of colour, where it has not just those."""
+_MOTION = ("twist", "poses")
 
 
 def is_bag(path: Path) -> bool:
@@ -75,47 +52,60 @@ def open_bag(path: Path, topics: dict[str, str] | None = None, grey: GreyRule = 
 
     Args:
         path: File or folder.
-        topics: Topic by kind (see ``KINDS``); by default the first of each kind.
+        topics: Topic by kind (see :data:`~neuroslam.sensors.bag_topics.KINDS`), and ``motion``, the
+            part of odometry that is used, ``twist`` or ``poses``; by default chosen by content.
         grey: How colour becomes grey.
 
     Raises:
-        SourceError: If ``rosbags`` is not installed, the bag is damaged, or it lacks a topic.
+        SourceError: If ``rosbags`` is not installed, the bag is damaged, or it has no topic that
+            can be used.
     """
-    topics = topics or {}
-    if unknown := set(topics) - set(KINDS):
+    topics = dict(topics or {})
+    options = (*KINDS, "motion")
+    if unknown := set(topics) - set(options):
         raise SourceError(
-            f"{path}: unknown option {min(unknown)!r}; expected one of {', '.join(KINDS)}"
-            f"{did_you_mean(min(unknown), KINDS)}"
+            f"{path}: unknown option {min(unknown)!r}; expected one of {', '.join(options)}"
+            f"{did_you_mean(min(unknown), options)}"
         )
+    part = topics.pop("motion", None)
+    if part is not None and part not in _MOTION:
+        raise SourceError(f"{path}: motion is {part!r}; expected twist or poses")
     with _opened(path) as reader:
-        available = {c.topic: c.msgtype for c in reader.connections}
+        msgtypes = {c.topic: c.msgtype for c in reader.connections}
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
-    chosen = {kind: _choose(path, kind, topics.get(kind), available) for kind in KINDS}
+        found = {kind: candidates(reader, kind) for kind in KINDS}
+        chosen = {
+            kind: choose(path, kind, topics.get(kind), found[kind], msgtypes) for kind in KINDS
+        }
     if chosen["image"] is None and chosen["odometry"] is None:
-        raise SourceError(
-            f"{path}: contains neither images nor odometry; its topics are {_listed(available)}"
-        )
+        raise SourceError(_nothing(path, found, msgtypes))
+    notes = tuple(
+        f"{path}: {note}" for kind in KINDS if (note := note_of(kind, chosen[kind], found[kind]))
+    )
     motion: BagMotion | None = None
     camera: BagCamera | None = None
-    if (topic := chosen["odometry"]) is not None:
-        motion = BagMotion(path, topic, chosen["scan"], counts[topic])
-    if (topic := chosen["image"]) is not None:
-        camera = BagCamera(path, topic, counts[topic], grey)
+    scan = chosen["scan"]
+    if (one := chosen["odometry"]) is not None:
+        use = part or (one.check.use if one.check else "twist")
+        motion = BagMotion(
+            path, one.topic, scan and scan.topic, counts[one.topic], by_poses=use == "poses"
+        )
+        motion.notes = notes
+    if (one := chosen["image"]) is not None:
+        camera = BagCamera(path, one.topic, counts[one.topic], grey, one.scale)
+        camera.choices = () if motion is not None else notes
     if camera is not None and motion is not None:
         return Streams(camera, motion)
     return cast(Source, camera or motion)  # one is there, as checked above
 
 
-def _choose(path: Path, kind: str, wanted: str | None, available: dict[str, str]) -> str | None:
-    fitting = sorted(topic for topic, msgtype in available.items() if msgtype in KINDS[kind])
-    if wanted is None:
-        return fitting[0] if fitting else None
-    if wanted not in fitting:
-        problem = f"has {available[wanted]}" if wanted in available else "is not in the bag"
-        raise SourceError(
-            f"{path}: topic {wanted!r} {problem}; topics for {kind}: {', '.join(fitting) or 'none'}"
-        )
-    return wanted
+def _nothing(path: Path, found: dict[str, list[Candidate]], msgtypes: dict[str, str]) -> str:
+    unusable = [note_of(kind, None, found[kind]) for kind in ("image", "odometry") if found[kind]]
+    readable = next((one.topic for one in found["image"] if one.readable), None)
+    if unusable:
+        hint = f"; to read it all the same: {path}?image={readable}" if readable else ""
+        return f"{path}: has no images or odometry that can be used; {'; '.join(unusable)}{hint}"
+    return f"{path}: contains neither images nor odometry; its topics are {_listed(msgtypes)}"
 
 
 def _listed(topics: dict[str, str]) -> str:
@@ -125,7 +115,7 @@ def _listed(topics: dict[str, str]) -> str:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise SourceError(
@@ -135,7 +125,9 @@ def _opened(path: Path) -> Iterator[Any]:
         kinds = get_typestore(Stores.ROS2_HUMBLE if path.suffix != ".bag" else Stores.ROS1_NOETIC)
         with AnyReader([path], default_typestore=kinds) as reader:
             yield reader
-    except (AnyReaderError, OSError, KeyError, ValueError, AssertionError) as error:
+    except NeuroslamError:  # about a topic or a frame, not about the file
+        raise
+    except Exception as error:  # the parser raises many types for damaged bytes
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise SourceError(
             f"{path}: is damaged or incomplete ({reason}); expected a ROS bag"
@@ -158,22 +150,26 @@ class _BagTopic(Source):
         self._begin()
         index, last_s = 0, -np.inf
         with _opened(self.path) as reader:
-            wanted = [c for c in reader.connections if c.topic in self.topics]
-            for connection, received_ns, data in reader.messages(connections=wanted):
+            for topic, received_ns, message in messages_of(reader, self.topics):
                 if stop is not None and index >= stop:
                     return
-                message = reader.deserialize(data, connection.msgtype)
-                time_s = _time_s(message, received_ns)
-                if connection.topic != self.topics[0]:
-                    self._update(message)
-                    continue
+                is_frame = topic == self.topics[0]
                 try:
-                    frame = self._frame(index, time_s, message)
+                    if message is None:
+                        raise BadFrame(
+                            f"{self.name}: frame {index}: its message"
+                            f"{'' if is_frame else f' of {topic}'} is damaged"
+                        )
+                    if not is_frame:
+                        self._update(message)
+                        continue
+                    time_s = time_of(message, received_ns)
                     if not time_s > last_s:
                         raise BadFrame(
                             f"{self.name}: frame {index}: its time {time_text(time_s)} is not "
                             f"after {time_text(last_s)}; times must rise"
                         )
+                    frame = self._frame(index, time_s, message)
                     last_s = time_s
                 except BadFrame as error:
                     if index >= start:
@@ -183,7 +179,7 @@ class _BagTopic(Source):
                 else:
                     if index >= start:
                         yield frame
-                index += 1
+                index += is_frame
 
     def _begin(self) -> None:
         """Reset the state of an earlier reading."""
@@ -197,40 +193,85 @@ class _BagTopic(Source):
 
 
 class BagCamera(_BagTopic):
-    """The images of one topic, in grey."""
+    """The images of one topic, in grey.
 
-    def __init__(self, path: Path, topic: str, n_messages: int, grey: GreyRule = "luma") -> None:
+    Attributes:
+        choices: Notes on the choice of the topic.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topic: str,
+        n_messages: int,
+        grey: GreyRule = "luma",
+        scale: PixelScale | None = None,
+    ) -> None:
         super().__init__(path, (topic,), n_messages)
         self.grey: GreyRule = grey
+        self.scale = scale or PixelScale()
+        self.choices: tuple[str, ...] = ()
         self._begin()
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The choice of the topic, and how images of more than 8 bits are scaled."""
+        note = self.scale.note()
+        return (*self.choices, f"{self.name}: {note}") if note else self.choices
 
     def _begin(self) -> None:
         self.shape: tuple[int, ...] | None = None
 
     def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
-        image = _grey(message, self.name, index, self.grey)
+        try:
+            image = grey_of(message, self.grey, self.scale, index)
+        except BadFrame as error:
+            raise BadFrame(f"{self.name}: frame {index}: {error}") from None
         self.shape = self.shape or image.shape
         require_shape(image, self.shape, self.name, index)
         return Frame(index, time_s, image=image)
 
 
 class BagMotion(_BagTopic):
-    """The measured motion of one topic, and the latest scan of another."""
+    """The measured motion of one topic, and the latest scan of another.
 
-    def __init__(self, path: Path, topic: str, scan: str | None, n_messages: int) -> None:
+    Args:
+        path: File or folder.
+        topic: Topic of odometry.
+        scan: Topic of scans; ``None``: no ranges.
+        n_messages: Number of messages of odometry.
+        by_poses: Motion is the change of the poses, not the twist.
+    """
+
+    def __init__(
+        self, path: Path, topic: str, scan: str | None, n_messages: int, by_poses: bool = False
+    ) -> None:
         super().__init__(path, (topic,) if scan is None else (topic, scan), n_messages)
+        self.by_poses = by_poses
         self._begin()
 
     def _begin(self) -> None:
         self.ranges: np.ndarray | None = None
+        self._before: OdometrySample | None = None
 
     def _update(self, message: Any) -> None:  # noqa: ANN401
-        self.ranges = full_turn(message.ranges, message.angle_min, message.angle_increment,
-                                message.range_min, message.range_max)  # fmt: skip
+        try:
+            self.ranges = full_turn(message.ranges, message.angle_min, message.angle_increment,
+                                    message.range_min, message.range_max)  # fmt: skip
+        except BadFrame as error:
+            raise BadFrame(f"{self.path}: {self.topics[1]}: {error}") from None
 
     def _frame(self, index: int, time_s: float, message: Any) -> Frame:  # noqa: ANN401
-        twist = message.twist.twist
-        v, w = float(twist.linear.x), float(twist.angular.z)
+        now = odometry_sample(message, time_s)
+        if self.by_poses:
+            if not np.isfinite(now[:5]).all():
+                raise BadFrame(
+                    f"{self.name}: frame {index}: its pose is x = {now.x_m} m, y = {now.y_m} m, "
+                    f"heading {now.heading_rad} rad; expected finite numbers"
+                )
+            before, self._before = self._before or now._replace(time_s=time_s - 1.0), now
+            return Frame(index, time_s, velocity=motion_between(before, now), ranges=self.ranges)
+        v, w = now.vx_m_s, now.w_rad_s
         if not (np.isfinite(v) and np.isfinite(w)):
             raise BadFrame(
                 f"{self.name}: frame {index}: v = {v} m/s, w = {w} rad/s; expected finite numbers"
@@ -254,12 +295,20 @@ def full_turn(
         Distances at ``N_RANGES`` bearings, counter-clockwise from straight ahead: that of the beam
         nearest in bearing; ``inf`` if no beam is within one step, or its distance is invalid.
 
+    Raises:
+        BadFrame: If there are no beams, or their bearings are not numbers.
+
     Example:
         >>> turn = full_turn(np.array([1.0, 2.0, 3.0]), -np.pi / 2, np.pi / 2, 0.1, 10.0)
         >>> turn[[270, 0, 90, 180]].tolist()
         [1.0, 2.0, 3.0, inf]
     """
     distances = np.asarray(ranges, np.float64)
+    if not (len(distances) and np.isfinite(first_rad) and np.isfinite(step_rad) and step_rad):
+        raise BadFrame(
+            f"scan of {len(distances)} beams from {first_rad} rad in steps of {step_rad} rad; "
+            "expected beams in steps other than 0"
+        )
     distances = np.where((distances >= min_m) & (distances <= max_m), distances, np.inf)
     bearings = np.arange(N_RANGES) * (TWO_PI / N_RANGES)
     middle = first_rad + 0.5 * step_rad * (len(distances) - 1)
@@ -267,41 +316,3 @@ def full_turn(
     beam = np.rint(offset / step_rad).astype(np.int64)
     covered = (beam >= 0) & (beam < len(distances))
     return np.where(covered, distances[beam.clip(0, len(distances) - 1)], np.inf)
-
-
-def _time_s(message: Any, received_ns: int) -> float:  # noqa: ANN401
-    stamp = message.header.stamp
-    stamped = stamp.sec + stamp.nanosec * 1e-9
-    return stamped if stamped > 0.0 else received_ns * 1e-9
-
-
-def _grey(message: Any, name: str, index: int, rule: GreyRule) -> np.ndarray:  # noqa: ANN401
-    if hasattr(message, "format"):
-        image = decode_grey(bytes(message.data), rule)
-        if image is None:
-            raise BadFrame(f"{name}: frame {index}: its {message.format} image is corrupt")
-        return image
-    if message.encoding not in _GREY:
-        raise BadFrame(
-            f"{name}: frame {index}: encoding {message.encoding!r}; expected one of "
-            f"{', '.join(_GREY)}"
-        )
-    kind, channels, conversion = _GREY[message.encoding]
-    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    h, w, used = message.height, message.width, message.width * channels * dtype.itemsize
-    data = np.asarray(message.data, np.uint8)
-    if message.step < used or len(data) < h * message.step:
-        raise BadFrame(
-            f"{name}: frame {index}: {len(data)} bytes in rows of {message.step} for {w} x {h} px "
-            f"{message.encoding}; the message is damaged"
-        )
-    rows = np.ascontiguousarray(data[: h * message.step].reshape(h, message.step)[:, :used])
-    pixels = rows.view(dtype).reshape((h, w) if channels == 1 else (h, w, channels))
-    if dtype.itemsize == 2:
-        return (pixels >> 8).astype(np.uint8)
-    if conversion is None:
-        return pixels.copy()
-    if rule == "luma":  # in one step, without rounding in between
-        return cv2.cvtColor(pixels, conversion)
-    to_bgr = _BGR.get(message.encoding)
-    return to_grey(pixels if to_bgr is None else cv2.cvtColor(pixels, to_bgr), rule)

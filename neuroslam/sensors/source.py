@@ -22,6 +22,8 @@ class Source(ABC):
         live: Whether the source is live: its frames cannot be read a second time.
         unused: Data that is in no frame, and why, one line each; complete once the source was
             read to its end.
+        notes: How the data is read, where that was a choice, one line each: topics of a bag, units,
+            bits of a pixel; complete once the source was read to its end.
         landmark_words: Names and attributes of its landmarks, empty if it knows none.
     """
 
@@ -30,6 +32,7 @@ class Source(ABC):
     frame_rate_hz: float | None
     live: bool = False
     unused: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     landmark_words: tuple[LandmarkWords, ...] = ()
 
     @abstractmethod

@@ -30,6 +30,7 @@ class Streams(Source):
         camera: Source of images; its motion is not used. If it has no images and ``motion`` has,
             the two are exchanged.
         motion: Source of motion.
+        offset_s: Seconds to add to the times of the motion, where the two clocks differ.
 
     Raises:
         SourceError: If there are no images or no motion, or the two do not overlap in time. An
@@ -44,7 +45,7 @@ class Streams(Source):
         [(0.0, True), (0.05, False), (0.1, True)]
     """
 
-    def __init__(self, camera: Source, motion: Source) -> None:
+    def __init__(self, camera: Source, motion: Source, offset_s: float = 0.0) -> None:
         first, second = _first_frame(camera), _first_frame(motion)
         if first.image is None and second.image is not None:
             camera, motion, first, second = motion, camera, second, first
@@ -57,6 +58,11 @@ class Streams(Source):
             raise SourceError(
                 f"{self.name}: {motion.name} has no motion; expected speed and turn rate"
             )
+        if offset_s:
+            motion, second = (
+                Shifted(motion, offset_s),
+                second._replace(time_s=second.time_s + offset_s),
+            )
         self.camera, self.motion = camera, motion
         self.n_frames = None
         self.frame_rate_hz = None
@@ -65,6 +71,11 @@ class Streams(Source):
         spans = [_span(camera, first), _span(motion, second)]
         if max(span[0] for span in spans) > min(span[1] for span in spans) + SAME_TIME_S:
             raise self._no_overlap(*spans)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of both sources."""
+        return (*self.motion.notes, *self.camera.notes)
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
@@ -143,8 +154,37 @@ class Streams(Source):
             for source, (low, high) in zip((self.camera, self.motion), spans, strict=True)
         )
         return SourceError(
-            f"{' and '.join(runs)}; expected an overlap; check that both use one clock"
+            f"{' and '.join(runs)}; expected an overlap; check that both use one clock, or give "
+            "--offset S, the seconds to add to the times of the motion, or --offset auto"
         )
+
+
+class Shifted(Source):
+    """A source whose times are all later by a constant.
+
+    Args:
+        source: The source.
+        offset_s: Seconds to add to its times.
+    """
+
+    def __init__(self, source: Source, offset_s: float) -> None:
+        self.source, self.offset_s = source, offset_s
+        self.name, self.n_frames = source.name, source.n_frames
+        self.frame_rate_hz, self.live = source.frame_rate_hz, source.live
+        self.landmark_words = source.landmark_words
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The notes of the source, and the offset."""
+        added = f"{self.name}: {time_text(self.offset_s)} are added to its times"
+        return (*self.source.notes, added)
+
+    def frames(
+        self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
+    ) -> Iterator[Frame]:
+        """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`."""
+        for frame in self.source.frames(start, stop, on_bad_frame):
+            yield frame._replace(time_s=frame.time_s + self.offset_s)
 
 
 class _Cursor:
@@ -195,7 +235,7 @@ def _unused(event: str, time_s: float, n: int | None, side: str) -> tuple[str]:
         if n is None
         else counted(n, f"image {side} it was", f"images {side} it were")
     )
-    return (f"motion {event} at {round(time_s, 2):.12g} s; {images} not used",)
+    return (f"motion {event} at {time_text(time_s)}; {images} not used",)
 
 
 def _first_frame(source: Source) -> Frame:
@@ -207,6 +247,10 @@ def _first_frame(source: Source) -> Frame:
 
 def _span(source: Source, first: Frame) -> tuple[float, float]:
     """Return the first and last time of a source; the last is a bound if it is not yet known."""
+    if isinstance(source, Shifted):
+        first = first._replace(time_s=first.time_s - source.offset_s)
+        low, high = _span(source.source, first)
+        return low + source.offset_s, high + source.offset_s
     if isinstance(source, IndexedSource):
         for index in range(source.n_frames - 1, first.index, -1):
             last = next(source.frames(index, index + 1, lambda _: None), None)

@@ -1,8 +1,10 @@
 """Sources without images: a motion CSV or the track of an animal; and the clock of all sources.
 
 A motion CSV has a header and one line per frame. The columns ``v_m_s`` and ``w_rad_s`` (or
-``vtrans`` and ``vrot``) are required. Optional are ``time_s`` and the true pose, ``x_m``, ``y_m``
-and ``theta_rad``, empty where unknown. Other columns are ignored.
+``vtrans`` and ``vrot``) are required. Optional are the time and the true pose, ``x_m``, ``y_m`` and
+``theta_rad``, empty where unknown. Other columns are ignored. The time is ``time_s`` or a column
+with another usual name, in s, ms, us or ns (:mod:`neuroslam.sensors.times`); a table with a column
+that looks like a time and has no usual name is refused.
 
 A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the times ``t``,
 ``(n,)`` in seconds, or an ``.npy`` with the positions alone.
@@ -10,16 +12,26 @@ A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the
 
 import csv
 import io
+import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from neuroslam.errors import BadFrame, SourceError
+from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.geometry import wrap_angles
 from neuroslam.sensors.source import IndexedSource
+from neuroslam.sensors.times import (
+    TimeColumn,
+    in_seconds,
+    parse_time,
+    time_column,
+    unit_note,
+    unrecognised_time,
+)
 from neuroslam.types import Frame, Pose, Velocity
 
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
@@ -28,6 +40,10 @@ _TRUTH = ("x_m", "y_m", "theta_rad")
 _MAX_SPEED = 1e6  # m/s, rad/s: only a damaged log has more, and its sums could overflow
 _MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
 _EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s and x_m,y_m,theta_rad"
+
+
+SLOWEST_S = 10.0
+"""Longest step of times that a format defines in seconds; a longer one shows another unit."""
 
 
 class Clock:
@@ -50,6 +66,9 @@ class Clock:
         self.name = name
         self.times_s = times_s
         self.frame_rate_hz = frame_rate_hz
+        self.notes: tuple[str, ...] = ()
+        if times_s is None:
+            self.notes = (f"{name}: has no times; {frame_rate_hz:g} frames per second assumed",)
         if times_s is not None:
             self._before = _latest_before(times_s)
             steps = np.diff(times_s[rising(times_s)])
@@ -110,6 +129,7 @@ class Track:
         times_s: Times in seconds, ``(n,)``; ``None`` if there are none.
         truth: True poses, ``(n, 3)``, NaN where unknown; ``None`` if there are none.
         rows: Name of each row, for messages.
+        notes: How the times were read, one line each.
     """
 
     name: str
@@ -117,6 +137,7 @@ class Track:
     times_s: np.ndarray | None
     truth: np.ndarray | None
     rows: Sequence[str]
+    notes: tuple[str, ...] = ()
 
     def velocity(self, index: int) -> Velocity:
         """Return the motion over the interval that ends at that frame.
@@ -148,6 +169,7 @@ class TrackSource(IndexedSource):
         self.clock = Clock(track.name, track.times_s, frame_rate_hz)
         self.n_frames = len(track.velocities)
         self.frame_rate_hz = self.clock.frame_rate_hz
+        self.notes = (*track.notes, *self.clock.notes)
 
     def frame(self, index: int) -> Frame:
         """Return the frame of that index, see :meth:`IndexedSource.frame`."""
@@ -166,14 +188,31 @@ def parse_motion(text: str, name: str) -> Track:
         >>> parse_motion("vtrans,vrot\n0.5,0.1\n", "walk.csv").velocity(0)
         Velocity(v_m_s=0.5, w_rad_s=0.1)
     """
-    table, rows = parse_table(text, name, _MOTION, _EXPECTED, optional=("time_s",), together=_TRUTH)
+    table, rows, notes = parse_table(
+        text, name, _MOTION, _EXPECTED, optional=("time_s",), together=_TRUTH
+    )
     return Track(
         name,
         np.column_stack([table[field] for field in _MOTION]),
         table.get("time_s"),
         np.column_stack([table[field] for field in _TRUTH]) if _TRUTH[0] in table else None,
         rows,
+        notes,
     )
+
+
+class Table(NamedTuple):
+    """A table of numbers.
+
+    Attributes:
+        columns: The columns by name, each ``(n,)``.
+        rows: Name of each row, for messages.
+        notes: How its times were read, one line each.
+    """
+
+    columns: dict[str, np.ndarray]
+    rows: list[str]
+    notes: tuple[str, ...] = ()
 
 
 def parse_table(
@@ -183,8 +222,13 @@ def parse_table(
     expected: str,
     optional: Sequence[str] = (),
     together: Sequence[str] = (),
-) -> tuple[dict[str, np.ndarray], list[str]]:
+    aliases: Mapping[str, str] | None = None,
+    on_bad_row: Callable[[str], object] | None = None,
+) -> Table:
     r"""Read a CSV of numbers with a header; an empty field is NaN.
+
+    Lines that start with ``#`` are comments, but the header may start with it. If ``time_s`` is
+    among the columns, the time column is found by any usual name and converted to seconds.
 
     Args:
         text: Content of the file.
@@ -192,50 +236,143 @@ def parse_table(
         needed: Required columns.
         expected: Description of the expected columns, for messages.
         optional: Optional columns.
-        together: Optional columns that are complete or absent.
-
-    Returns:
-        The columns by name, each ``(n,)``; the name of each row, for messages.
+        together: Optional columns that are complete or absent; a field that is no number is NaN,
+            with a note.
+        aliases: Name of the column for each other name that it may have, in lower case.
+        on_bad_row: Called with the fault of each row that cannot be read, which is then left out;
+            ``None``: the fault is raised.
 
     Raises:
-        SourceError: If the table is empty, lacks a column, or a line does not fit the header.
+        SourceError: If the table is empty, lacks a column, its times are not recognised, or a line
+            does not fit the header.
 
     Example:
-        >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "")[0]["y_m"]
+        >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "").columns["y_m"]
         array([ 2., nan])
     """
-    reader = csv.reader(io.StringIO(text))
-    numbered = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
-    if not numbered:
+    header, numbered = _header_and_rows(text)
+    if not header:
         raise SourceError(f"{name}: is empty; {expected}, and one line per frame")
-    header = [field.strip().lower() for field in numbered[0][1]]
-    columns = [_ALIASES.get(field, field) for field in header]
+    lowered = [field.strip().lstrip("#").strip().lower() for field in header]
+    known = _ALIASES | dict(aliases or {})
+    columns = [known.get(field, field) for field in lowered]
+    with_time = "time_s" in (*needed, *optional)
+    time = time_column(header) if with_time else None
+    if time is not None:
+        columns = [column if column != "time_s" else "" for column in columns]
+        columns[time.index] = "time_s"
     needed = [*needed, *(together if any(field in columns for field in together) else ())]
     missing = [field for field in needed if field not in columns]
     if missing:
         raise SourceError(
-            f"{name}: has the columns {','.join(header)[:100]}, but no {missing[0]}; {expected}"
+            f"{name}: has the columns {','.join(lowered)[:100]}, but no {missing[0]}; {expected}"
         )
-    if len(numbered) == 1:
+    if not numbered:
         raise SourceError(f"{name}: has a header, but no lines; expected one line per frame")
     wanted = [*(field for field in optional if field in columns), *needed]
+    if with_time and time is None:
+        _require_no_times(header, columns, [row for _, row in numbered], wanted, name)
     numbers = [columns.index(field) for field in wanted]
-    values = np.empty((len(numbered) - 1, len(wanted)))
-    for out, (line, row) in zip(values, numbered[1:], strict=True):
-        if len(row) != len(columns):
-            raise SourceError(f"{name}: line {line} has {len(row)} values; expected {len(columns)}")
-        for at, number in enumerate(numbers):
-            out[at] = _number(row[number], name, line, wanted[at])
-    rows = [f"line {line}" for line, _ in numbered[1:]]
-    return dict(zip(wanted, values.T, strict=True)), rows
+    values, rows, lost = [], [], []
+    for line, row in numbered:
+        try:
+            if len(row) != len(columns):
+                raise SourceError(
+                    f"{name}: line {line} has {len(row)} values; expected {len(columns)}"
+                )
+            found = []
+            for column, number in zip(wanted, numbers, strict=True):
+                try:
+                    found.append(_number(row[number], name, line, column, column == "time_s"))
+                except SourceError as fault:
+                    if column not in together:
+                        raise
+                    found.append(math.nan)
+                    lost.append(str(fault))
+            if time is not None and time.rest is not None:
+                found.append(_number(row[time.rest], name, line, header[time.rest]))
+            values.append(found)
+            rows.append(f"line {line}")
+        except SourceError as fault:
+            if on_bad_row is None:
+                raise
+            on_bad_row(str(fault))
+    array = np.array(values, dtype=np.float64).reshape(len(values), -1)
+    table = dict(zip(wanted, array.T, strict=False)) if len(values) else {
+        field: np.zeros(0) for field in wanted
+    }  # fmt: skip
+    notes: tuple[str, ...] = ()
+    if lost:
+        notes = (f"{counted(len(lost), 'field')} of truth cannot be read, the first: {lost[0]}",)
+    if time is not None:
+        rest = array[:, -1] if time.rest is not None and len(values) else None
+        table["time_s"], told = _as_seconds(table["time_s"], rest, time, name)
+        notes = (*told, *notes)
+    return Table(table, rows, notes)
 
 
-def _number(text: str, name: str, line: int, column: str) -> float:
-    try:
-        return float(text) if text.strip() else np.nan
-    except ValueError:
+def _header_and_rows(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header, and the rows with the number of their line, without comments."""
+    reader = csv.reader(io.StringIO(text))
+    lines = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
+    comments = [row for _, row in lines if row[0].lstrip().startswith("#")]
+    rows = [(number, row) for number, row in lines if not row[0].lstrip().startswith("#")]
+    leading = 0
+    while leading < len(lines) and lines[leading][1][0].lstrip().startswith("#"):
+        leading += 1
+    if leading and (not rows or all(_is_number(field) for field in rows[0][1])):
+        return comments[leading - 1], rows  # numpy.savetxt writes the header as a comment
+    return (rows[0][1], rows[1:]) if rows else ([], [])
+
+
+def _is_number(text: str) -> bool:
+    return not text.strip() or parse_time(text) is not None
+
+
+def _require_no_times(
+    header: list[str], columns: list[str], rows: list[list[str]], wanted: list[str], name: str
+) -> None:
+    """Refuse a table without a time column if another column looks like one."""
+    names, values = [], []
+    for index, (raw, column) in enumerate(zip(header, columns, strict=True)):
+        if column in wanted or column in _TRUTH:
+            continue
+        fields = [row[index] if index < len(row) else "" for row in rows]
+        parsed = [parse_time(field) for field in fields]
+        names.append(raw.strip())
+        values.append(None if None in parsed else np.array(parsed, dtype=np.float64))
+    found = unrecognised_time(names, values)
+    if found is not None:
         raise SourceError(
-            f"{name}: line {line}: {column} is {text.strip()[:40]!r}; expected a number"
+            f"{name}: its times are not recognised: column {found!r} looks like a time; name it "
+            "time_s, time_ms, time_us or time_ns, or leave it out if it is none"
+        )
+
+
+def _as_seconds(
+    values: np.ndarray, rest: np.ndarray | None, column: TimeColumn, name: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Convert a time column to seconds, and say how, unless it is ``time_s`` in seconds."""
+    whole = bool((values == np.floor(values)).all())
+    if rest is not None and whole and bool(((rest >= 0) & (rest < 1e9)).all()):
+        note = f"{name}: times are columns {column.index + 1} and {(column.rest or 0) + 1}"
+        return values + rest / 1e9, (f"{note}, in seconds and nanoseconds",)
+    times_s, unit = in_seconds(values, column.unit)
+    if column.name.lower() == "time_s" and unit == "s":
+        return times_s, ()
+    return times_s, (unit_note(f"{name}: column {column.name!r}", column.unit, unit),)
+
+
+def _number(text: str, name: str, line: int, column: str, is_time: bool = False) -> float:
+    if not text.strip():
+        return math.nan
+    try:
+        time_s = parse_time(text) if is_time else None
+        return float(text) if time_s is None else time_s
+    except ValueError:
+        also = " of seconds, or a date and time as 2024-05-01T12:00:00" if is_time else ""
+        raise SourceError(
+            f"{name}: line {line}: {column} is {text.strip()[:40]!r}; expected a number{also}"
         ) from None
 
 
@@ -245,7 +382,7 @@ def read_track(path: Path, frame_rate_hz: float) -> Track:
     Raises:
         SourceError: If the file is damaged, contains pickled objects, or lacks the arrays.
     """
-    _, times, positions = read_positions(path)
+    _, times, positions, notes = read_positions(path)
     n = len(positions)
     usable = np.isfinite(positions).all(axis=1)
     if times is not None:
@@ -254,15 +391,27 @@ def read_track(path: Path, frame_rate_hz: float) -> Track:
     velocities, truth = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
     if usable.any():
         velocities[usable], truth[usable] = motion_along(clock[usable], positions[usable])
-    return Track(str(path), velocities, times, truth, [f"row {row}" for row in range(n)])
+    return Track(str(path), velocities, times, truth, [f"row {row}" for row in range(n)], notes)
 
 
-def read_positions(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray]:
+class Positions(NamedTuple):
+    """The file of a track.
+
+    Attributes:
+        arrays: All arrays of the file by name.
+        times_s: Times in seconds, ``(n,)``; ``None`` if there are none.
+        positions: ``(n, 2)`` in metres.
+        notes: How the times were read, one line each.
+    """
+
+    arrays: dict[str, np.ndarray]
+    times_s: np.ndarray | None
+    positions: np.ndarray
+    notes: tuple[str, ...]
+
+
+def read_positions(path: Path) -> Positions:
     """Read the file of a track.
-
-    Returns:
-        All arrays of the file by name; the times, ``(n,)`` in s, or ``None``; the positions,
-        ``(n, 2)`` in m.
 
     Raises:
         SourceError: If the file is damaged, contains pickled objects, or lacks the arrays.
@@ -281,8 +430,11 @@ def read_positions(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None
             f"{path}: {', '.join(f'{key} is {shape}' for key, shape in shapes.items())}; "
             "expected numbers, pos (n, 2) in metres and t (n,) in seconds, n above 0"
         )
-    times = arrays["t"].astype(np.float64) if "t" in arrays else None
-    return arrays, times, arrays["pos"].astype(np.float64)
+    times, notes = None, ()
+    if "t" in arrays:
+        times, unit = in_seconds(arrays["t"], slowest_s=SLOWEST_S)
+        notes = () if unit == "s" else (unit_note(f"{path}: t", None, unit),)
+    return Positions(arrays, times, arrays["pos"].astype(np.float64), notes)
 
 
 def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,9 @@
-"""A video file as a source of frames."""
+"""A video file as a source of frames.
+
+The time of a frame is its presentation time, which the container states for each frame: phones and
+screen recorders have variable frame rates, and pauses are gaps. Only a raw stream has no
+presentation times; its frames are ``1 / fps`` apart.
+"""
 
 import math
 import os
@@ -11,7 +16,9 @@ import cv2
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors.grey import to_grey
 from neuroslam.sensors.images import quiet_opencv, require_shape
+from neuroslam.sensors.mp4 import read_mp4
 from neuroslam.sensors.source import OnBadFrame, Source
+from neuroslam.sensors.tracks import time_text
 from neuroslam.types import Frame, GreyRule
 
 VIDEO_SUFFIXES = (
@@ -19,17 +26,19 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".ogv", ".mjpeg", ".mjpg", ".3gp"),
 )
 
-# These containers store their number of frames. For the others the decoder estimates it from the
-# duration and the frame rate, and the true number may be lower or higher.
-_COUNTED = (".avi", ".mp4", ".m4v", ".mov", ".3gp")
+# These containers store their number of frames, and so do those of read_mp4. For the others the
+# decoder estimates it from the duration and the frame rate: the true number may differ.
+_COUNTED = (".avi",)
+_ROUNDING_S = 1e-6
+"""A presentation time this near to a multiple of the frame period is that multiple."""
 
 
 class VideoSource(Source):
-    """Grey frames of a video, at times ``index / fps``.
+    """Grey frames of a video, at their presentation times in seconds.
 
     Args:
         path: The file.
-        frame_rate_hz: Frame rate, if the container states none.
+        frame_rate_hz: Frame rate, if the container states neither times nor a rate.
         grey: How colour becomes grey.
 
     Raises:
@@ -45,6 +54,8 @@ class VideoSource(Source):
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             with quiet_opencv():
                 success, image = capture.read()
+                first_s = _presented_s(capture)
+                self._has_times = capture.grab() and _presented_s(capture) > first_s
         if not success:
             raise SourceError(
                 f"{self.name}: no frame can be decoded; expected a complete video file"
@@ -53,7 +64,11 @@ class VideoSource(Source):
         self._rate_hz = fps if math.isfinite(fps) and fps > 0 else frame_rate_hz
         self.frame_rate_hz = self._rate_hz
         is_counted = self.path.suffix.lower() in _COUNTED and count > 0
-        self.n_frames = int(count) if is_counted else None
+        self._mp4 = read_mp4(self.path)
+        if self._mp4 is not None:
+            self.n_frames = self._mp4.n_frames
+        else:
+            self.n_frames = int(count) if is_counted else None
 
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
@@ -64,39 +79,70 @@ class VideoSource(Source):
         frames than its container states ends with one bad frame.
         """
         with self._capture() as capture:
-            index = 0
+            index, latest_s = 0, -math.inf
             while stop is None or index < stop:
                 with quiet_opencv():
                     success = capture.grab()
                 if not success:
                     break
-                if index >= start:
-                    try:
-                        frame = self._retrieve(capture, index)
-                    except BadFrame as error:
+                time_s = self._time_s(capture, index, latest_s)
+                try:
+                    if not time_s > latest_s:
+                        raise BadFrame(
+                            f"{self.name}: frame {index}: its time {time_text(time_s)} is not "
+                            f"after {time_text(latest_s)}; times must rise"
+                        )
+                    latest_s = time_s
+                    frame = self._retrieve(capture, index, time_s) if index >= start else None
+                except BadFrame as error:
+                    if index >= start:
                         if on_bad_frame is None:
                             raise
                         on_bad_frame(error)
-                    else:
+                else:
+                    if frame is not None:
                         yield frame
                 index += 1
-        n_frames = index if self.n_frames is None else self.n_frames
-        if index < n_frames and (stop is None or index < stop):
-            missing = BadFrame(
-                f"{self.name}: frame {index} is missing; expected {counted(n_frames, 'frame')}, as "
-                "the container states; check that the file is complete"
+        missing = self._missing(index, latest_s)
+        if missing and (stop is None or index < stop):
+            fault = BadFrame(
+                f"{self.name}: frame {index} is missing; expected {missing}, as the container "
+                "states; check that the file is complete"
             )
             if on_bad_frame is None:
-                raise missing
-            on_bad_frame(missing)
+                raise fault
+            on_bad_frame(fault)
 
-    def _retrieve(self, capture: cv2.VideoCapture, index: int) -> Frame:
+    def _time_s(self, capture: cv2.VideoCapture, index: int, latest_s: float) -> float:
+        """Return the presentation time of the frame that was grabbed last.
+
+        OpenCV gives 0 for a frame without one, such as the last of an MPEG program stream: it is
+        one period after the frame before it.
+        """
+        regular_s = index / self._rate_hz
+        if not self._has_times:
+            return regular_s
+        time_s = _presented_s(capture)
+        if time_s == 0.0 and index > 0:
+            time_s = latest_s + 1.0 / self._rate_hz
+        return regular_s if abs(time_s - regular_s) <= _ROUNDING_S else time_s
+
+    def _missing(self, n_frames: int, latest_s: float) -> str:
+        """Return what the container states, if there are fewer frames than that."""
+        if self.n_frames is not None and n_frames < self.n_frames:
+            return counted(self.n_frames, "frame")
+        edited = None if self._mp4 is None else self._mp4.edited
+        if edited is not None and latest_s < edited.duration_s - 1.5 * edited.longest_frame_s:
+            return f"frames until {time_text(edited.duration_s)}"
+        return ""
+
+    def _retrieve(self, capture: cv2.VideoCapture, index: int, time_s: float) -> Frame:
         with quiet_opencv():
             decoded, image = capture.retrieve()
         if not decoded:
             raise BadFrame(f"{self.name}: frame {index} cannot be decoded")
         require_shape(image[..., 0], self.image_shape, self.name, index)
-        return Frame(index, index / self._rate_hz, image=to_grey(image, self.grey, "bgr"))
+        return Frame(index, time_s, image=to_grey(image, self.grey, "bgr"))
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:
@@ -110,6 +156,11 @@ class VideoSource(Source):
             yield capture
         finally:
             capture.release()
+
+
+def _presented_s(capture: cv2.VideoCapture) -> float:
+    """Return the presentation time of the frame that was grabbed last, in seconds."""
+    return capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
 
 
 @contextmanager

@@ -37,6 +37,7 @@ from neuroslam.spiking.vocabulary import (
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, without_gradients
+from neuroslam.state.pickling import Calls
 from neuroslam.state.population import (
     Belief,
     Correction,
@@ -134,7 +135,7 @@ class SemanticCells(Population):
             None  # a recorder's, called in each step
         )
         self.register_load_state_dict_pre_hook(_take_pointers)
-        self.register_load_state_dict_post_hook(lambda cells, _: cells._index())
+        self.register_load_state_dict_post_hook(Calls("_index"))
 
     @property
     def n(self) -> int:

@@ -23,8 +23,9 @@ RUN_TABLES = ("frames.csv", "experiences.csv", "links.csv")
 RUN_FIGURES = (
     "frames", "seconds", "cpu_seconds", "frames_per_s", "frames_per_cpu_s", "templates",
     "views", "experiences", "links", "loop_closures", "merges", "merge_reports", "refused_merges",
-    "not_joined", "frames_on_no_joined_map", "skipped_frames", "skipped", "unused", "pictures",
-    "tables", "interrupted", "ate_rmse_m", "odometry_ate_rmse_m",
+    "not_joined", "frames_on_no_joined_map", "skipped_frames", "skipped", "unused", "notes",
+    "measured_motion", "warnings", "pictures", "tables", "interrupted",
+    "ate_rmse_m", "odometry_ate_rmse_m",
 )  # fmt: skip
 """Figures that every run has: a population's counts must be called otherwise."""
 

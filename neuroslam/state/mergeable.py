@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
 from itertools import chain
 from operator import is_
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, ParamSpec, Self, TypeVar, cast, overload
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor, nn
 
 from neuroslam.errors import MapError
 from neuroslam.state.join import Join
+from neuroslam.state.pickling import packed, unpacked
+from neuroslam.threads import without_autocast
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -54,6 +56,33 @@ class QuickModule(nn.Module):
         if name in self._modules:
             self.__dict__.pop(name, None)
         super().__delattr__(name)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move or convert all tensors, as ``.to`` does; refuse types of too few digits.
+
+        Raises:
+            TypeError: If the type would be of 16 bits or less.
+        """
+        dtype = fn(torch.empty(0)).dtype
+        if dtype.is_floating_point and dtype.itemsize < 4:
+            raise TypeError(
+                f"{type(self).__name__}: {dtype} has too few digits for its activity and "
+                "positions; expected torch.float32 or torch.float64, or a device alone"
+            )
+        self.__dict__.pop("_arrays", None)  # parameters are moved in place
+        return super()._apply(fn, recurse)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle keeps: tensors as arrays, and each part once.
+
+        Arrays that view the tensors are left out, for they would not share the copy's memory.
+        """
+        left_out = {*self.__dict__["_modules"], "_arrays"}
+        return packed({name: v for name, v in self.__dict__.items() if name not in left_out})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over the attributes of another module of the class."""
+        super().__setstate__(unpacked(state))
 
 
 class BufferModule(QuickModule):
@@ -101,10 +130,6 @@ class BufferModule(QuickModule):
         arrays = tuple(cast(Tensor, tensor).detach().numpy() for tensor in own)
         self.__dict__["_arrays"] = own, arrays
         return arrays
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy takes: not the arrays, which would not share the copy's memory."""
-        return {name: value for name, value in self.__dict__.items() if name != "_arrays"}
 
 
 class ModulesOf(nn.ModuleList, Generic[M]):
@@ -170,13 +195,13 @@ def _make_room(module: BufferModule, state: State, prefix: str, *_unused: object
 
 
 def without_gradients(step: Callable[P, T]) -> Callable[P, T]:
-    """Let a step run in inference mode; one that does so already loses no time by it."""
+    """Let a step run in inference mode and without autocast; in a brain it loses no time by it."""
 
     @wraps(step)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
         if torch.is_inference_mode_enabled():
             return step(*args, **kwargs)
-        with torch.inference_mode():
+        with torch.inference_mode(), without_autocast():
             return step(*args, **kwargs)
 
     return run

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.pickling import Calls
 
 _ID_BITS = 40
 
@@ -89,9 +90,9 @@ class SessionLog(Mergeable):
         self.merges: list[dict[str, Any]] = []
         self.refusals: list[dict[str, Any]] = []
         self.register_buffer("text", torch.zeros(0, dtype=torch.uint8))
-        self.register_state_dict_pre_hook(lambda module, *_: module._write())
+        self.register_state_dict_pre_hook(Calls("_write"))
         self.register_load_state_dict_pre_hook(_take_length)
-        self.register_load_state_dict_post_hook(lambda module, _: module._read())
+        self.register_load_state_dict_post_hook(Calls("_read"))
 
     @property
     def now(self) -> Session:

@@ -1,11 +1,13 @@
 """State that grows or changes every frame: tables of rows, and named numbers."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from neuroslam.state.pickling import packed, unpacked
 
 
 class GrowingTable(nn.Module):
@@ -111,9 +113,23 @@ class GrowingTable(nn.Module):
             self._arrays[name] = column, whole = column, column.numpy()
         return whole
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the columns as ``.to`` does; they keep their types, as rows are of 64 bits."""
+
+        def moved(column: Tensor) -> Tensor:
+            to = fn(column)
+            return to if to.dtype == column.dtype else column.to(to.device)
+
+        self._arrays = {}
+        return super()._apply(moved, recurse)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy keeps: numpy's views are of this table's columns alone."""
-        return self.__dict__ | {"_arrays": {}}
+        return packed(self.__dict__ | {"_arrays": {}})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over the columns of another table, in memory of its own."""
+        super().__setstate__(unpacked(state))
 
     def __len__(self) -> int:
         """Return the number of rows in use."""

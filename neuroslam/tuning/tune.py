@@ -16,9 +16,9 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.style import save
 from neuroslam.figures.tuning import plot_tuning
 from neuroslam.runs.files import write_text
-from neuroslam.runs.parallel import one_thread
 from neuroslam.sensors import Source, open_source
 from neuroslam.state.registry import leading_class
+from neuroslam.threads import limit_threads
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
@@ -172,8 +172,9 @@ def tune(
             f"{opened.name}: is live; tuning reads its source several times, so tune on a recording"
         )
     report = on_stage or (lambda stage: None)
-    with one_thread():
+    with limit_threads():
         tuning = _tune(opened, config, stop, report, features)
+        tuning.notes[:0] = opened.notes
         figure = plot_tuning(tuning, opened.name)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -49,6 +49,7 @@ class Walk:
         arena: The arena, or ``None`` if it is not known.
         spikes_s: Spike times of a cell in seconds, ``(m,)``, or ``None``.
         n_dropped: Number of dropped rows of the file: no number, or a time that does not rise.
+        notes: How the times of the file were read, one line each.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Walk:
     arena: Arena | None = None
     spikes_s: np.ndarray | None = None
     n_dropped: int = 0
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def along(
@@ -172,9 +174,9 @@ def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | N
         raise SourceError(f"{path}: no such file; expected an .npz with pos and t, or a CSV")
     arrays: dict[str, np.ndarray] = {}
     if path.suffix.lower() == ".npz":
-        arrays, times_s, positions = read_positions(path)
+        arrays, times_s, positions, notes = read_positions(path)
     else:
-        table, _ = parse_table(
+        table, _, notes = parse_table(
             read_text(path), str(path), _TABLE, f"expected {','.join(_TABLE)}: seconds and metres"
         )
         times_s, positions = table["time_s"], np.column_stack([table["x_m"], table["y_m"]])
@@ -191,7 +193,7 @@ def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | N
         )
     arena = Arena.from_arrays(arrays) if any(key in arrays for key in ARENA_KEYS) else None
     walk = Walk.along(str(path), times_s[usable], positions[usable], arena)
-    walk = replace(walk, spikes_s=_spikes(arrays, path), n_dropped=len(usable) - n)
+    walk = replace(walk, spikes_s=_spikes(arrays, path), n_dropped=len(usable) - n, notes=notes)
     walk = walk if rate_hz is None else walk.resampled(rate_hz)
     return walk if minutes is None else walk.lasting(minutes)
 

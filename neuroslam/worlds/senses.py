@@ -185,6 +185,7 @@ class ArenaSource(IndexedSource):
         self.name, self.walk, self.seed, self.beams = walk.name, walk, seed, beams
         self.beam_noise_m = noise.wall_distance_m
         self.n_frames = len(walk.times_s)
+        self.notes = walk.notes
         self.frame_rate_hz = walk.rate_hz
         self.senses = sense(walk, noise, [seed])
         turned = wrap_angles(np.diff(self.senses.heading_rad[0], prepend=self._heading(0)))

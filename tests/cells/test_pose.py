@@ -429,3 +429,17 @@ def test_a_nudge_moves_every_brain_of_a_batch_as_it_moves_one():
     for cells in (one, batch):
         cells.nudge(0.4, -1.2, 2.5)
     torch.testing.assert_close(batch.activity, one.activity.expand(2, -1, -1, -1))
+
+
+@pytest.mark.parametrize("speed", [400.0, 3e3, 1e6])
+def test_a_motion_many_times_round_the_torus_moves_as_the_definition_says(speed, monkeypatch):
+    ours, defined = (PoseCellNetwork(PoseCellConfig()) for _ in range(2))
+    for k in range(4):
+        motion = Motion(speed * (1.0 - 1.7 * (k % 2)), 0.4, 0.05)
+        ours.integrate(motion)
+        with monkeypatch.context() as patch:
+            patch.setattr("neuroslam.cells.pose.runs_compiled", lambda *_: False)
+            defined.integrate(motion)
+    found, expected = to_dense(ours.packet), to_dense(defined.packet)
+    assert float(found.sum()) == pytest.approx(1.0, abs=1e-4)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0.0)

@@ -474,7 +474,7 @@ def test_evaluate_says_how_many_frames_have_truth(finished, tmp_path, call):
     (tmp_path / "half.tum").write_text("".join(rows[:6]))
     done = call("evaluate", finished, "--truth", tmp_path / "half.tum")
     assert (done.code, done.err) == (0, "")
-    assert done.out.endswith("6 of 12 frames have a true pose; the errors are over those\n")
+    assert done.out.endswith("6 of 12 frames have truth; the errors are over those\n")
     assert "have truth" not in call("evaluate", finished).out
 
 

@@ -223,7 +223,8 @@ def test_sources_that_do_not_overlap_are_refused_with_both_ranges():
     for one, two in ((camera, motion), (motion, camera)):
         assert refused(lambda one=one, two=two: Streams(one, two)) == (
             "camera runs from 0 s to 2 s and motion runs from 10 s to 14 s; "
-            "expected an overlap; check that both use one clock"
+            "expected an overlap; check that both use one clock, or give --offset S, the seconds "
+            "to add to the times of the motion, or --offset auto"
         )
 
 
