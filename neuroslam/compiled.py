@@ -10,10 +10,11 @@ compiled anew in each process where neither can be written.
 import os
 import types
 from collections.abc import Callable
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
-import numpy as np
-from torch import Tensor
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,6 +24,10 @@ ENABLED = os.environ.get("NEUROSLAM_COMPILED", "1") != "0"
 
 STEPS: dict[str, "Compiled[Any, Any]"] = {}
 """Every compiled step of the files imported so far, by ``module.name``."""
+
+
+announce: Callable[[], object] | None = None
+"""Called once in a process, before the first step that is not kept on disk is compiled."""
 
 
 class Compiled(Generic[P, R]):
@@ -51,6 +56,7 @@ class Compiled(Generic[P, R]):
             import numba  # a quarter of a second: only where a step runs
 
             self._dispatcher = _kept(numba.njit, self._linked())
+            _announce_unless_kept(self._dispatcher)
         return self._dispatcher
 
     def _linked(self) -> Callable[P, R]:
@@ -83,6 +89,16 @@ def _kept(njit: Callable[..., Any], function: Callable[P, R]) -> Callable[P, R]:
         return njit(**options)(function)
 
 
+def _announce_unless_kept(dispatcher: object) -> None:
+    """Call :data:`announce` if numba has not kept this step; not knowing that, do nothing."""
+    global announce
+    index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    path = getattr(index, "_index_path", None)
+    if announce is not None and path is not None and not os.path.exists(path):
+        tell, announce = announce, None
+        tell()
+
+
 def compiled(plain: Callable[P, R]) -> Compiled[P, R]:
     """Mark a function as a compiled step.
 
@@ -99,7 +115,7 @@ def compiled(plain: Callable[P, R]) -> Compiled[P, R]:
     return Compiled(plain)
 
 
-def runs_compiled(*tensors: Tensor) -> bool:
+def runs_compiled(*tensors: "Tensor") -> bool:
     """Return whether a compiled step may take these tensors: on the CPU, without gradients.
 
     Example:
@@ -115,10 +131,11 @@ def runs_compiled(*tensors: Tensor) -> bool:
     return True
 
 
-def plain_array(array: np.ndarray) -> np.ndarray:
+def plain_array(array: "np.ndarray") -> "np.ndarray":
     """Return an array that is contiguous and may be written, itself where it is: one type of it.
 
     Example:
+        >>> import numpy as np
         >>> plain_array(np.zeros((4, 6))[:, ::2]).flags.c_contiguous
         True
     """

@@ -4,7 +4,7 @@ A step stands under its definition; each that Python calls has a case in ``compi
 """
 
 import ast
-import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -87,6 +87,25 @@ def test_a_step_calls_steps_of_its_own_file_only(path):
     mine = [s for s in STEPS.values() if s.__wrapped__.__code__.co_filename == str(path)]
     for step in mine:
         assert not foreign & set(step.plain.__code__.co_names)
+
+
+def test_what_is_not_kept_is_announced_once(monkeypatch, tmp_path):
+    said = []
+    monkeypatch.setattr("neuroslam.compiled.announce", lambda: said.append("compiling"))
+    (tmp_path / "fresh.py").write_text(
+        "def one(x):\n    return x + 1.0\n\n\ndef two(x):\n    return x + 2.0\n"
+    )
+    spec = importlib.util.spec_from_file_location("fresh", tmp_path / "fresh.py")
+    fresh = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "fresh", fresh)
+    spec.loader.exec_module(fresh)
+    assert compiled(fresh.one)(1.0) == 2.0
+    assert said == ["compiling"]
+    assert compiled(fresh.two)(1.0) == 3.0
+    assert said == ["compiling"]
+    monkeypatch.setattr("neuroslam.compiled.announce", lambda: said.append("again"))
+    assert compiled(fresh.one)(1.0) == 2.0
+    assert said == ["compiling"]
 
 
 def test_steps_compile_where_no_folder_can_be_written(tmp_path):

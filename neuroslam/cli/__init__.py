@@ -15,10 +15,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import typer
 from typer.core import TyperGroup
 
+from neuroslam import compiled
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
 from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
 from neuroslam.cli.options import with_plugins
-from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, say
+from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, console, say
 from neuroslam.cli.results import (
     ask_command,
     evaluate_command,
@@ -145,6 +146,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
     command = arguments[0] if arguments else ""
     try:
+        if console.is_terminal:
+            compiled.announce = lambda: say("compiling, once on this machine: up to half a minute")
         with _quiet_writers(), _warnings_in_one_line(command):
             return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except typer.Abort:
