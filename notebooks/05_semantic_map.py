@@ -67,7 +67,7 @@ plt.show()
 
 # %%
 world = paper_world()
-path = band_limited_path(60.0, 0.06, seed=5, time_step_s=0.01, reach_m=0.95)
+path = band_limited_path(60.0, 0.06, seed=4, time_step_s=0.01, reach_m=0.95)
 config = SSPSLAMConfig(
     tier="algebraic",
     time_step_s=0.01,

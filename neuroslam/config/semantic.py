@@ -191,8 +191,8 @@ class PathIntegratorConfig(Section):
     velocity_neurons: int = Field(
         default=0,
         ge=0,
-        description="neurons that represent the velocity; larger: less noise; 0: the exact "
-        "velocity",
+        description="neurons that represent the velocity, in tiers of neurons; larger: less "
+        "noise; 0: the exact velocity",
     )
     phase_noise_rad: float = Field(
         default=0.0,

@@ -51,7 +51,7 @@ def ssp_map(
         The content of ``results.json``: ``rows``, one for each query.
     """
     out, world = Path(out_folder), paper_world()
-    path = band_limited_path(seconds, 0.06, seed=5, time_step_s=0.01, reach_m=0.95)
+    path = band_limited_path(seconds, 0.06, seed=4, time_step_s=0.01, reach_m=0.95)
     space = SSPSpaceConfig(n_rotations=5, n_scales=5, reach_m=1.2)
     config = SSPSLAMConfig(
         tier=tier,

@@ -218,14 +218,14 @@ def plot_vectors(
                 ax.plot(time_s[known], errors[name][known], color=colour, lw=1.1, label=label)
         dot: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 7, "mfc": "white"}
         place.plot(*position_m, zorder=9, mec=INK, mew=1.3, **dot)
-        write_title(place, "Map at the end", "x: recalled positions · arrows: vectors")
+        write_title(place, "Map at the end", "x: recalled · arrows: vectors")
         alike.set(xlabel="time (s)", ylabel="1 - similarity", xlim=(0, time_s[-1]))
         later = [distance_error[n][time_s >= first_seen_s[n] + 1.0] for n in estimates_m]
         most = max((float(e.max()) for e in later if len(e)), default=1.0)
         far.set(xlabel="time (s)", ylabel="error (m)", xlim=(0, time_s[-1]))
         far.set_ylim(0, 1.5 * max(most, 1e-3))
         write_title(alike, "Dissimilarity of the vector", "pale: not yet seen")
-        write_title(far, "Error of the vector's end", "axis: from 1 s after the first sight")
+        write_title(far, "Error of the vector", "axis: from 1 s after first sight")
         handles, labels = alike.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)))
     return figure
@@ -284,7 +284,7 @@ def plot_posterior(
     """
     (x0, x1), (y0, y1) = world.bounds_m
     with mpl.rc_context(STYLE):
-        figure = new_figure(2.9 * len(snapshots) + 0.6, 3.3, title)
+        figure = new_figure(2.9 * len(snapshots) + 0.6, 3.9, title)
         axes = figure.subplots(1, len(snapshots), squeeze=False, sharey=True).ravel()
         for ax, (name, (density, truth)) in zip(axes, snapshots.items(), strict=True):
             ax.imshow(

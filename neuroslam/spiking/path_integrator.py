@@ -20,6 +20,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
     view,
 )
+from neuroslam.spiking.populations import VelocityPopulation
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.spiking.vector_steps import (
     CLEARLY_BETTER,
@@ -37,6 +38,7 @@ _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
 _LOOK_S = 0.004  # time between two decodings of the position
 REREAD_STEPS = 100  # steps between two decodings over the whole space
+_VELOCITY_SEED = 8  # added to the seed; smaller ones are of other parts of SSP-SLAM
 
 
 def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilise: float) -> Tensor:
@@ -208,10 +210,13 @@ class PathIntegrator(Packet):
 
     :func:`oscillator_dynamics` has the mathematics. Each oscillator is a population of neurons for
     three numbers: a point of the unit circle and its rate, as a share of the rate at the highest
-    speed. Decoders are solved for amplitudes near the unit circle.
+    speed. Decoders are solved for amplitudes near the unit circle. With ``velocity_neurons`` the
+    velocity is what a population of its own says
+    (:class:`~neuroslam.spiking.populations.VelocityPopulation`), else it is exact.
 
-    State: the neurons' (``neurons``), and ``recurrent``, ``external``, ``output``,
-    ``position_m``; parameters of the space are its own and part of the state as well.
+    State: the neurons' (``neurons``, and ``velocity`` if there are any), and ``recurrent``,
+    ``external``, ``output``, ``position_m``; parameters of the space are its own and part of the
+    state as well.
 
     Args:
         space: Of the positions.
@@ -260,11 +265,23 @@ class PathIntegrator(Packet):
         fastest = space.wave_vectors.detach().norm(dim=-1) * config.max_speed_m_s
         self.register_buffer("fastest_rad_s", fastest)
         self.register_buffer("decoders", self._solve(draw))
+        self.velocity = None
+        if config.velocity_neurons:
+            self.velocity = VelocityPopulation(
+                config.velocity_neurons, space.dimension, config.max_speed_m_s, neurons,
+                time_step_s, seed + _VELOCITY_SEED, batch, config.decoder_noise,
+            )  # fmt: skip
 
     @property
     def n_neurons(self) -> int:
-        """Number of neurons of one animal, in all oscillators."""
-        return self.neurons.n_neurons
+        """Number of neurons of one animal: of all oscillators, and of the velocity."""
+        return self.neurons.n_neurons + self.config.velocity_neurons
+
+    def runs_compiled(self, *tensors: Tensor) -> bool:
+        """Return whether a compiled step may advance all neurons and take these tensors."""
+        if self.velocity is not None and not self.velocity.runs_compiled():
+            return False
+        return self.neurons.runs_compiled(*tensors)
 
     def _solve(self, draw: torch.Generator) -> Tensor:
         """Decoders of what comes back and of what is read out, ``(groups, neurons, 4)``.
@@ -293,7 +310,7 @@ class PathIntegrator(Packet):
 
     @torch.no_grad()
     def start(self, position_m: Tensor) -> None:
-        """Set the oscillators to a position, ``(batch, dimension)``.
+        """Set the oscillators to a position, ``(batch, dimension)``, and the animal to rest.
 
         The neurons' voltages are left as they are; they settle within a few milliseconds.
         """
@@ -301,6 +318,8 @@ class PathIntegrator(Packet):
         point = torch.view_as_real(z).transpose(0, 1).contiguous()
         self.recurrent, self.output = point, point.clone()
         self.external = torch.zeros_like(point)
+        if self.velocity is not None:
+            self.velocity.silence()
         self._place(position_m)
 
     def forward(self, velocity_m_s: Tensor, pull: Tensor | None = None) -> Tensor:
@@ -314,18 +333,20 @@ class PathIntegrator(Packet):
         Returns:
             Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.
         """
-        space, neurons = self.space, self.neurons
+        space = self.space
         own = space.frequencies, space.length_scale_m
         given = (velocity_m_s,) if pull is None else (velocity_m_s, pull)
         if (
             velocity_m_s.shape == cast(Tensor, self._buffers["position_m"]).shape
-            and neurons.runs_compiled(*own, *given)
+            and self.runs_compiled(*own, *given)
             and may_share(self, "recurrent", "external", "output", "position_m")
         ):
             velocity, numbers = velocity_m_s.to(own[0].dtype).contiguous().numpy(), None
             if pull is not None:
                 numbers = torch.view_as_real(pull).to(own[0].dtype).contiguous().numpy()
             return torch.view_as_complex(torch.from_numpy(self.advance(velocity, numbers)))
+        if self.velocity is not None:
+            velocity_m_s = self.velocity(velocity_m_s)
         waves = space.wave_vectors
         share = (velocity_m_s @ (waves / self.fastest_rad_s.unsqueeze(-1)).T).clamp(-1.0, 1.0)
         pull = coupled(self.z, pull, self.position_m, self.space, self.config)
@@ -351,6 +372,8 @@ class PathIntegrator(Packet):
             c, dt = self.config, self.time_step_s
             kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
             walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
+        if self.velocity is not None:
+            velocity = self.velocity.advance(velocity)
         tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
         n, batch, _ = output.shape
         x = np.empty((n, batch, 3), dtype=output.dtype)

@@ -1,4 +1,4 @@
-"""Grid, place and object-vector cells: neurons whose encoders are spatial semantic pointers."""
+"""Grid, place and object-vector cells, whose encoders are pointers; cells of the velocity."""
 
 from typing import cast
 
@@ -11,6 +11,7 @@ from neuroslam.spiking.ensemble import (
     NeuronArray,
     filtered,
     lowpass,
+    may_share,
     replace,
     sample_tuning,
     synapse,
@@ -156,6 +157,93 @@ class VectorPopulation(BufferModule):
         """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
         x = z.reshape(1, len(z), -1)
         said = self.neurons.respond(x, view(self, "decoders")[None]).reshape(z.shape)
+        decoded = filtered(view(self, "decoded"), said, synapse(TAU_S, self.time_step_s))
+        replace(self, decoded=decoded)
+        return decoded
+
+
+class VelocityPopulation(BufferModule):
+    r"""Represents the velocity by cells tuned to a direction and to speed along it.
+
+    .. math:: J_i = \alpha_i\, e_i \cdot v / v_{max} + \beta_i, \qquad
+              \hat v = \sum_i d_i\,(a_i * h), \qquad h(t) = e^{-t/\tau} / \tau
+
+    (SSP-SLAM, Sect. 2.2.1; Eqs. 8 to 10; :math:`\tau` is 10 ms). Decoders are solved for
+    velocities up to the highest speed; higher speeds are represented as less than they are.
+
+    State: the neurons' and ``decoded``, m/s, ``(batch, dimension)``.
+
+    Args:
+        neurons: Number of cells.
+        dimension: Of the velocity.
+        max_speed_m_s: :math:`v_{max}`.
+        config: Model of the neurons.
+        time_step_s: Length of a step.
+        seed: Of the neurons.
+        batch: Animals side by side; they have the same network.
+        decoder_noise: Noise for which the decoders are solved, as a share of the highest rate.
+
+    Example:
+        >>> cells = VelocityPopulation(300, 2, 0.5, NeuronConfig(model="lif_rate"), 1e-3)
+        >>> for _ in range(100):
+        ...     decoded = cells(torch.tensor([[0.3, -0.1]]))
+        >>> [round(x, 2) for x in decoded[0].tolist()]
+        [0.3, -0.1]
+    """
+
+    decoders: Tensor
+    decoded: Tensor
+
+    def __init__(
+        self,
+        neurons: int,
+        dimension: int,
+        max_speed_m_s: float,
+        config: NeuronConfig,
+        time_step_s: float,
+        seed: int = 0,
+        batch: int = 1,
+        decoder_noise: float = 0.005,
+    ) -> None:
+        super().__init__()
+        self.time_step_s = time_step_s
+        draw = torch.Generator().manual_seed(seed)
+        tuning = sample_tuning(1, neurons, dimension, config, draw, radius=max_speed_m_s)
+        self.neurons = NeuronArray(tuning, config, time_step_s, draw, batch)
+        # Uniform over the ball's volume, not over its radius.
+        direction = torch.randn(1, _SOLVER_POINTS, dimension, generator=draw)
+        direction = direction / direction.norm(dim=-1, keepdim=True)
+        share = torch.rand(1, _SOLVER_POINTS, 1, generator=draw).pow(1.0 / dimension)
+        velocity = max_speed_m_s * share * direction
+        decoders = self.neurons.solve(velocity, velocity, decoder_noise)
+        self.register_buffer("decoders", decoders / time_step_s)
+        self.register_buffer("decoded", torch.zeros(batch, dimension))
+
+    @property
+    def n_neurons(self) -> int:
+        """Number of neurons of one animal."""
+        return self.neurons.n_neurons
+
+    def runs_compiled(self, *tensors: Tensor) -> bool:
+        """Return whether a compiled step may advance the cells and take these tensors."""
+        return self.neurons.runs_compiled(*tensors) and may_share(self, "decoders", "decoded")
+
+    def silence(self) -> None:
+        """Forget the velocity that was decoded; the neurons' voltages are left as they are."""
+        self.decoded = torch.zeros_like(self.decoded)
+
+    def forward(self, velocity_m_s: Tensor) -> Tensor:
+        """Step with a velocity; return the decoded velocity, both m/s, ``(batch, dimension)``."""
+        if velocity_m_s.shape == self.decoded.shape and self.runs_compiled(velocity_m_s):
+            velocity = velocity_m_s.to(self.decoded).contiguous()
+            return torch.from_numpy(self.advance(velocity.numpy()))
+        said = torch.bmm(self.neurons(velocity_m_s.to(self.decoded).unsqueeze(0)), self.decoders)[0]
+        self.decoded = lowpass(self.decoded, said, synapse(TAU_S, self.time_step_s))
+        return self.decoded
+
+    def advance(self, velocity: np.ndarray) -> np.ndarray:
+        """Step as :meth:`forward` does, compiled; arrays ``(batch, dimension)``."""
+        said = self.neurons.respond(velocity[None], view(self, "decoders"))[0]
         decoded = filtered(view(self, "decoded"), said, synapse(TAU_S, self.time_step_s))
         replace(self, decoded=decoded)
         return decoded

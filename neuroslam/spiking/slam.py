@@ -318,7 +318,7 @@ class SSPSLAM(BufferModule):
         )  # fmt: skip
         if isinstance(walk, PathIntegrator):
             memory = cast(AssociativeMap, self.map)
-            populations = walk.neurons, memory.memory
+            populations = walk, memory.memory
             return all(each.runs_compiled(walk.output) for each in populations) and runs_compiled(
                 *tensors, memory.decoders, memory.rule
             )

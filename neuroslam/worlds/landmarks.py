@@ -215,13 +215,25 @@ def random_world(
 
 
 def paper_world() -> LandmarkWorld:
-    """Make the world of the paper's Fig. 4: three points with attributes, and an L of walls."""
+    """Make the world of the paper's Fig. 4: three points with attributes, and walls in a corner.
+
+    The positions are those of SSP-SLAM, Eqs. 21 to 24. The wall is one L in the upper left corner,
+    two boxes of ``[x_min, x_max] x [y_min, y_max]``: ``[-1.1, -0.95] x [0.5, 1.1]`` and
+    ``[-1.0, -0.4] x [0.95, 1.1]``, which overlap where they meet.
+
+    Example:
+        >>> world = paper_world()
+        >>> world.named("BLUE_SQUARE").position_m.tolist()
+        [0.6, 0.2]
+        >>> world.observe([-0.7, 0.8]).in_view.tolist()
+        [False, False, False, True]
+    """
     return make_world(
         [
-            point("BLUE_SQUARE", (0.6, -0.2), "BLUE * SQUARE"),
+            point("BLUE_SQUARE", (0.6, 0.2), "BLUE * SQUARE"),
             point("BLUE_TRIANGLE", (0.0, -0.6), "BLUE * TRIANGLE"),
             point("ORANGE_TRIANGLE", (-0.2, 0.2), "ORANGE * TRIANGLE"),
-            wall("WALL", ((-1.1, 0.95), (0.5, 1.1)), ((0.95, 0.4), (1.1, 1.1))),
+            wall("WALL", ((-1.1, 0.5), (-0.95, 1.1)), ((-1.0, 0.95), (-0.4, 1.1))),
         ],
         reach_m=1.2,
         view_radius_m=0.3,

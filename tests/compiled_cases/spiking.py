@@ -87,7 +87,8 @@ def made(name):
     model = NeuronConfig(model="stepped_lif" if name == "stepped" else "lif", tau_ref_s=0.0023)
     if name in ("walk", "modules", "none"):
         coupling = {"walk": "manifold"}.get(name, name)
-        config = PathIntegratorConfig(neurons=30, coupling=coupling)
+        cells = 12 if name == "modules" else 0
+        config = PathIntegratorConfig(neurons=30, coupling=coupling, velocity_neurons=cells)
         return PathIntegrator(space, config, model, 1e-3, batch=2)
     if name == "objects":
         return VectorPopulation.of_objects(space, 30, model, 1e-3, batch=2)

@@ -43,8 +43,13 @@ TIERS = {
         "grid_neurons": 90,
         "places": True,
         "map": SemanticMapConfig(neurons=120, relay=True),
+        "integrator": PathIntegratorConfig(neurons=200, velocity_neurons=200),
     },
-    "quantised": {**SMALL, "quantised": True, "integrator": PathIntegratorConfig(neurons=300)},
+    "quantised": {
+        **SMALL,
+        "quantised": True,
+        "integrator": PathIntegratorConfig(neurons=300, velocity_neurons=200),
+    },
 }
 
 
@@ -350,7 +355,7 @@ def test_questions_to_a_map_of_attributes_and_walls():
     world = paper_world()
     space = SSPSpaceConfig(n_rotations=5, n_scales=5, length_scale_m=0.3, reach_m=1.2)
     slam = slam_in(SSPSLAMConfig(**VECTORS, space=space, places=True), world)
-    stops = np.array([[0.5, -0.1], [0.1, -0.5], [-0.1, 0.3], [0.8, 0.8]])
+    stops = np.array([[0.5, 0.3], [0.1, -0.5], [-0.1, 0.3], [-0.5, 0.8]])
     for at in stops:
         slam.start(torch.from_numpy(at[None]))
         still = np.tile(at, (200, 1, 1))
@@ -360,7 +365,7 @@ def test_questions_to_a_map_of_attributes_and_walls():
     far = np.linalg.norm(blue.position_m.numpy()[:, None] - truth, axis=-1)
     assert far.shape == (2, 2)
     assert (far.min(0) < 0.02).all()
-    amounts = queries.what(slam, (0.3, -0.5), (0.9, 0.1))
+    amounts = queries.what(slam, (0.3, -0.1), (0.9, 0.5))
     assert amounts["BLUE_SQUARE"] > 0.5 > amounts["BLUE_TRIANGLE"]
     assert set(queries.landmarks_in(slam, (-0.5, -0.5), (0.9, 0.5))) >= {
         "BLUE_SQUARE",
@@ -375,7 +380,7 @@ def test_questions_to_a_map_of_attributes_and_walls():
     whole = queries.whole_map(slam)
     z = torch.fft.rfft(whole) * torch.fft.rfft(slam.pointers[2]).conj()
     found = slam.integrator.decoder(z[None, 1:]).position_m[0]
-    np.testing.assert_allclose(found, [-0.2, 0.2], atol=0.03)
+    np.testing.assert_allclose(found, [-0.2, 0.2], atol=0.05)  # the others are noise in one vector
     to = queries.vectors_to(slam, slam.integrator.z[0])
     there = slam.integrator.decoder(to[0][None]).position_m[0]
     np.testing.assert_allclose(there, truth[0] - stops[-1], atol=0.02)

@@ -38,8 +38,14 @@ def test_a_wall_is_as_far_as_its_nearest_point():
 def test_the_paper_s_world_has_attributes_and_an_l_of_walls():
     world = paper_world()
     assert world.named("BLUE_TRIANGLE").pointer == "BLUE * TRIANGLE"
-    assert len(world.named("WALL").boxes_m) == 2
     assert world.box_landmark.tolist() == [0, 1, 2, 3, 3]
+    # SSP-SLAM, Eqs. 21 to 24.
+    points = [landmark.position_m.tolist() for landmark in world.landmarks[:3]]
+    assert points == [[0.6, 0.2], [0.0, -0.6], [-0.2, 0.2]]
+    boxes = world.named("WALL").boxes_m
+    assert boxes.tolist() == [[[-1.1, 0.5], [-0.95, 1.1]], [[-1.0, 0.95], [-0.4, 1.1]]]
+    overlap = boxes[:, 1].min(0) - boxes[:, 0].max(0)
+    assert (overlap > 0).all(), "the two boxes are one wall"
 
 
 def test_random_worlds_follow_from_the_seed():
