@@ -139,7 +139,7 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
 
     Example:
         >>> t = np.arange(0.0, 30.0, 0.1)
-        >>> turned = np.sin(t[:-1]) * np.cos(0.37 * t[:-1] ** 1.3)
+        >>> turned = np.random.default_rng(0).normal(0.0, 0.1, len(t) - 1)
         >>> round(best_offset(Turns(t, turned), Turns(t + 1700000000.25, turned)).offset_s, 6)
         -1700000000.25
     """
@@ -172,6 +172,10 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
             "one has the wrong sign; expected positive turn rates to the left"
         )
     least = max(_LEAST_CORRELATION, _LEAST_DEVIATIONS * chance)
+    if least > 1.0:
+        raise ValueError(
+            "the two turn too evenly, or for too short a time, to tell an offset from chance"
+        )
     if correlation[best] < least:
         raise ValueError(
             "the turn rates of camera and motion do not agree at any offset: they correlate by "

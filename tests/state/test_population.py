@@ -454,10 +454,11 @@ def test_run_and_sweep_print_what_the_population_counts(plugin, call, tmp_path):
     done = call("run", WORLD, *options, "--no-tensorboard", "--out", tmp_path / "run")
     assert "\ndraws 5\n" in done.out
     done = call("sweep", WORLD, *options, "--vary", "draws.step=1,2", "--out", tmp_path / "sweep")
-    table = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines()]
-    assert [row[-1] for row in table if row] == ["5", "10"] or [
-        row[-2] for row in table if row
-    ] == ["5", "10"]
+    lines = done.out.splitlines()
+    head = next(line for line in lines if "draws.step" in line)
+    column = [cell.strip() for cell in head.split("┃")].index("draws")
+    rows = [[cell.strip() for cell in line.split("│")] for line in lines if line.startswith("│")]
+    assert [row[column] for row in rows] == ["5", "10"]
 
 
 def test_without_its_file_a_run_and_a_brain_say_how_to_give_it(plugin, call, mistake, tmp_path):
