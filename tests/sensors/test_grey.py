@@ -13,9 +13,10 @@ from neuroslam.merging.mapped import differing_keys
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.runs.run import resolve_config, run
 from neuroslam.sensors import open_source
+from neuroslam.sensors.bag_images import ENCODINGS, grey_of
 from neuroslam.sensors.camera import CameraSource
 from neuroslam.sensors.grey import to_grey
-from neuroslam.sensors.rosbag import _GREY, _grey
+from neuroslam.sensors.pixels import PixelScale
 from neuroslam.view.preprocess import encode
 
 WORLD = "world:corridor?width=64&height=40&frames_per_lap=60&laps=1.2&noise=0.02&odometry=0"
@@ -107,33 +108,40 @@ def test_the_rule_holds_for_a_camera(monkeypatch):
     assert (frame.image == mean_of(colourful(5))).all()
 
 
-@pytest.mark.parametrize("encoding", [name for name, (_, _, code) in _GREY.items() if code])
+@pytest.mark.parametrize("encoding", [name for name, kind in ENCODINGS.items() if kind.to_luma])
 def test_the_rule_holds_for_every_encoding_of_a_bag(encoding):
     """A uniform colour, so that the interpolation of Bayer pixels and of chroma adds nothing."""
     red, green, blue = 200, 90, 40
     h, w = 8, 12
+    wide = ENCODINGS[encoding].size == 2
     rgb = np.full((h, w, 3), (red, green, blue), np.uint8)
     if encoding.startswith("bayer"):
         of = {"r": red, "g": green, "b": blue}
-        pattern = encoding.removeprefix("bayer_").removesuffix("8")
+        pattern = encoding.removeprefix("bayer_").removesuffix("8").removesuffix("16")
         tile = np.array([of[letter] for letter in pattern], np.uint8).reshape(2, 2)
         pixels = np.tile(tile, (h // 2, w // 2))
-    elif encoding.startswith("yuv"):
+    elif "yuv" in encoding or "uyv" in encoding:
         y, u, v = 110, 60, 190
-        code = cv2.COLOR_YUV2RGB_UYVY if encoding == "yuv422" else cv2.COLOR_YUV2RGB_YUY2
-        pair = (u, y, v, y) if encoding == "yuv422" else (y, u, y, v)
+        chroma_first = encoding in ("yuv422", "uyvy")
+        code = cv2.COLOR_YUV2RGB_UYVY if chroma_first else cv2.COLOR_YUV2RGB_YUY2
+        pair = (u, y, v, y) if chroma_first else (y, u, y, v)
         pixels = np.tile(np.array(pair, np.uint8).reshape(2, 2), (h, w // 2, 1))
         rgb = cv2.cvtColor(pixels, code)
     else:
         order = {"b": blue, "g": green, "r": red, "a": 255}
-        names = {"8UC3": "bgr", "8UC4": "bgra"}.get(encoding, encoding.removesuffix("8"))
+        names = encoding.removesuffix("8").removesuffix("16")
+        if "UC" in encoding:
+            names = "bgr" if encoding.endswith("3") else "bgra"
         pixels = np.tile(np.array([order[n] for n in names], np.uint8), (h, w, 1))
+    if wide:
+        pixels = pixels.astype("<u2") << 8
     message = SimpleNamespace(
-        encoding=encoding, height=h, width=w, step=pixels.nbytes // h, data=pixels.reshape(-1),
-        is_bigendian=0,
+        encoding=encoding, height=h, width=w, step=pixels.nbytes // h,
+        data=pixels.reshape(-1).view(np.uint8), is_bigendian=0,
     )  # fmt: skip
-    assert (_grey(message, "bag", 0, "mean") == mean_of(rgb)).all()
-    assert (_grey(message, "bag", 0, "luma") != mean_of(rgb)).all()
+    scale = PixelScale(16, 1)
+    assert (grey_of(message, "mean", scale) == mean_of(rgb)).all()
+    assert (grey_of(message, "luma", scale) != mean_of(rgb)).all()
 
 
 def test_views_and_odometry_of_a_brain_use_the_same_rule():
