@@ -72,9 +72,11 @@ def main() -> int:
         cells = (row.step, row.size, written(row.ms), f"{y:.3g}", row.target, row.beside, row.more)
         print("| " + " | ".join(cells) + " |")
     now = {name: y for name, (y, _) in found.items()}
+    last = json.loads(LAST.read_text()) if LAST.is_file() else {}
+    slower = lost(now, last) if asked.check else []
     if asked.write:
-        LAST.write_text(json.dumps({k: round(v, 5) for k, v in now.items()}, indent=1) + "\n")
-    slower = lost(now, json.loads(LAST.read_text())) if asked.check else []
+        kept = last | {name: round(y, 5) for name, y in now.items()}
+        LAST.write_text(json.dumps(kept, indent=1) + "\n")
     print(*slower, sep="\n")
     return 1 if slower else 0
 

@@ -120,6 +120,8 @@ def memorise(
                     mine[j] += moved * (far * name[j] - mine[j])
         for o in range(n_value):
             said[o] += recalls * (recalled[b, o] - said[o])
+            if abs(said[o]) < NOTHING:
+                said[o] = 0.0
             new_rule[b, o] = error_now[b, o] + errs * (rule[b, o] - error_now[b, o])
             new_relayed[b, o] = passed[b, o] + errs * (relayed[b, o] - passed[b, o])
             new_taught[b, o] = value[b, o] + teaches * (taught[b, o] - value[b, o])
