@@ -78,7 +78,7 @@ def rows() -> list[Row]:
         alone(50)
         ms = milliseconds({"together": together, "alone": alone}, steps)
         one, side_by_side = ms["alone"] / ALONE, ms["together"] / BRAINS
-        told = f"{one / side_by_side:.1f} times one alone, which takes {written(one)}"
+        ratio = f"{one / side_by_side:.1f} times one alone, which takes {written(one)}"
         size = f"a step of one of {BRAINS} brains"
-        found.append(Row(name, size, side_by_side, "", "", told))
+        found.append(Row(name, size, side_by_side, "", "", ratio))
     return found

@@ -4,7 +4,7 @@ A compiled step stands in the file of the step that defines it, in torch or nump
 same result up to rounding. It takes numpy arrays that share memory with the buffers, and is used
 where one brain runs on the CPU without gradients. ``NEUROSLAM_COMPILED=0`` in the environment turns
 all of them off. What was compiled is kept beside the file or in the user's cache folder, and
-compiled anew in each process where neither can be written.
+compiled again in each process where neither can be written.
 """
 
 import os

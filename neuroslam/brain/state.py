@@ -100,11 +100,11 @@ class BrainState(QuickModule):
         self.register_load_state_dict_pre_hook(_make_stored)
         self.register_load_state_dict_post_hook(Calls("_loaded"))
         self.register_state_dict_pre_hook(_refuse_half_taken)
-        # Attributes that a pickle makes anew; a subclass may have more.
+        # Attributes that a pickle does not keep; a subclass may have more.
         self._own = frozenset((*self.__dict__, *self._modules, "_own"))
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        """Return how a pickle makes the brain anew: from its config, its network and its state.
+        """Return how a pickle rebuilds the brain: from its config, its network and its state.
 
         Raises:
             RuntimeError: If the state is not that of any frame, see :attr:`half_taken`.

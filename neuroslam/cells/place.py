@@ -433,19 +433,24 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         if self._near is not None:
             self._write_back()
             self._near = None
-        c, now, grows, told = self.config, self.now, False, -1 if learns is None else int(learns)
+        c, now, grows, learning = (
+            self.config,
+            self.now,
+            False,
+            -1 if learns is None else int(learns),
+        )
         while True:
             *arrays, _ = cast(Arrays, self.arrays())
             done = compete_step(
-                grows, rates, position_m, dt_s, now.stay_s, told, c.power, c.continuity_m,
+                grows, rates, position_m, dt_s, now.stay_s, learning, c.power, c.continuity_m,
                 c.threshold_m, c.hebbian_rate, c.excitation, c.excitation_m, *arrays,
             )  # fmt: skip
             grows = done >= 4
             if not grows:
                 break
             self._grow()
-        stay_s = 0.0 if done >= 2 or told >= 0 else now.stay_s
-        now.stay_s = stay_s + dt_s if told < 0 else stay_s
+        stay_s = 0.0 if done >= 2 or learning >= 0 else now.stay_s
+        now.stay_s = stay_s + dt_s if learning < 0 else stay_s
         return int(arrays[6][0]), done % 2 == 1
 
     def _response(self, recruited: Tensor, changed: Tensor) -> PlaceResponse:

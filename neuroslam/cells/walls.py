@@ -156,6 +156,25 @@ def _recalled(
 
 
 @compiled
+def _correct(
+    residual: float, variance: float, n: int, moves: np.ndarray, change: np.ndarray,
+    p: np.ndarray, errors: np.ndarray, walls: np.ndarray, active: np.ndarray,
+    position_m: np.ndarray,
+) -> None:  # fmt: skip
+    """Correct state and covariance, in place, by a residual whose covariance is ``moves``."""
+    for j in range(n):
+        change[j] = moves[j] / variance
+    for i in range(n):
+        for j in range(n):
+            p[i, j] -= change[i] * moves[j]
+    for j in range(n):
+        change[j] *= residual
+    _apply_step(change, errors, walls, active)
+    position_m[0] += change[0]
+    position_m[1] += change[1]
+
+
+@compiled
 def correct_step(
     first: int, position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray,
     compass: bool, learns: bool, time_s: float, most: int, numbers: np.ndarray,
@@ -204,15 +223,7 @@ def correct_step(
             turn = _wrapped(bearing - walls[0, wall, 2])
             for j in range(n):
                 moves[j] = p[3, j]
-                change[j] = p[3, j] / variance
-            for i in range(n):
-                for j in range(n):
-                    p[i, j] -= change[i] * moves[j]
-            for j in range(n):
-                change[j] *= turn
-            _apply_step(change, errors, walls, active)
-            position_m[0] += change[0]
-            position_m[1] += change[1]
+            _correct(turn, variance, n, moves, change, p, errors, walls, active, position_m)
             x, y, bearing = position_m[0], position_m[1], bearing - change[3]
         wall, row = active[0, slot], OWN + slot
         half = _wrapped(bearing - walls[0, wall, 2]) / 2
@@ -233,16 +244,7 @@ def correct_step(
             continue
         if time_s - walls[0, wall, 5] > _OLD_S:
             accepted[0] = True
-        for j in range(n):
-            change[j] = moves[j] / variance
-        for i in range(n):
-            for j in range(n):
-                p[i, j] -= change[i] * moves[j]
-        for j in range(n):
-            change[j] *= off
-        _apply_step(change, errors, walls, active)
-        position_m[0] += change[0]
-        position_m[1] += change[1]
+        _correct(off, variance, n, moves, change, p, errors, walls, active, position_m)
     return -1, _DONE
 
 

@@ -29,8 +29,8 @@ def tune_command(
     from neuroslam.tuning import tune
 
     settings = resolve_config(preset, config, tuple(assignments or ()))
-    source, told = resolve_offset(source, offset, settings)
-    for note in told:
+    source, found = resolve_offset(source, offset, settings)
+    for note in found:
         say(note)
     with show_stages("tune") as on_stage:
         tuning = tune(

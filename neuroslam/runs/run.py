@@ -160,7 +160,7 @@ def run(
     words = () if landmarks is None else read_landmarks(landmarks)
     stored = [load_brain(path) for path in paths]  # first: nothing is written if this fails
     config = _with_absolute_weights(config or (stored[0].config if stored else BrainConfig()))
-    source, told = resolve_offset(str(source), offset, config)
+    source, found = resolve_offset(str(source), offset, config)
     plan = replace(plan, source=_absolute(source))
     opened = _opened(source, plan, config)
     if opened.n_frames is not None and start >= opened.n_frames:
@@ -168,7 +168,7 @@ def run(
             f"{source}: has {counted(opened.n_frames, 'frame')}, none from --start {start} on"
         )
     brain = NavigationBrain(config, features=features)
-    summary = RunSummary(notes=[*told, *opened.notes])
+    summary = RunSummary(notes=[*found, *opened.notes])
     brain.about = (plan.name, preset, recorded(plan.source))
     _name_landmarks(brain, opened, words)
     for one in stored:

@@ -110,8 +110,8 @@ def open_kitti(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Ima
     times_file = path / "times.txt"
     times, truth, notes = None, None, []
     if times_file.is_file():
-        times, told = parse_times(read_text(times_file), str(times_file))
-        notes += told
+        times, found = parse_times(read_text(times_file), str(times_file))
+        notes += found
     numbered = path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt"
     for poses_file in (path / "poses.txt", numbered):
         if poses_file.is_file():

@@ -140,9 +140,9 @@ class ImageSource(IndexedSource):
             ) from None
         note, before = self.scale.note(), self._scale_note
         if note != before:
-            told = f"{self.name}: "
-            kept = tuple(line for line in self.notes if not before or line != told + before)
-            self.notes, self._scale_note = (*kept, told + note), note
+            label = f"{self.name}: "
+            kept = tuple(line for line in self.notes if not before or line != label + before)
+            self.notes, self._scale_note = (*kept, label + note), note
         return image
 
     def _pixels(self, index: int) -> np.ndarray:
@@ -447,9 +447,9 @@ def _with_notes(
             f"{name}: contains no images; expected files like 000000{IMAGE_SUFFIXES[0]}"
         )
     file = next((note for note in ("times.txt", "times.csv") if note in notes), None)
-    times_s, told = None, ()
+    times_s, found = None, ()
     if file is not None:
-        times_s, told = parse_times(notes[file], f"{name}: {file}")
+        times_s, found = parse_times(notes[file], f"{name}: {file}")
     motion = notes.get("odometry.csv")
     return ImageSource(
         name,
@@ -458,7 +458,7 @@ def _with_notes(
         frame_rate_hz,
         None if motion is None else parse_motion(motion, f"{name}: odometry.csv"),
         grey=grey,
-        notes=told,
+        notes=found,
     )
 
 

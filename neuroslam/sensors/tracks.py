@@ -306,8 +306,8 @@ def parse_table(
         notes = (f"{counted(len(lost), 'field')} of truth cannot be read, the first: {lost[0]}",)
     if time is not None:
         rest = array[:, -1] if time.rest is not None and len(values) else None
-        table["time_s"], told = _as_seconds(table["time_s"], rest, time, name)
-        notes = (*told, *notes)
+        table["time_s"], found = _as_seconds(table["time_s"], rest, time, name)
+        notes = (*found, *notes)
     return Table(table, rows, notes)
 
 
