@@ -12,18 +12,21 @@ from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, fi
 from neuroslam.state.files import load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 
-def save_brain(brain: NavigationBrain, path: str | Path) -> None:
+def save_brain(brain: NavigationBrain, path: str | Path) -> str:
     """Write config and complete state of a brain to one file, atomically.
 
     Args:
         brain: The brain; it is not changed.
         path: File, usually with the suffix ``.safetensors``.
+
+    Returns:
+        SHA-256 of config and state.
     """
     about = {"format": FORMAT_VERSION, "config": brain.config.model_dump(mode="json")}
-    save_checked(path, about, brain.state_dict())
+    return save_checked(path, about, brain.state_dict())
 
 
 def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
@@ -33,10 +36,12 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         CheckpointError: If the file is missing, no brain file, a pickle, truncated, of a newer
             format, altered since it was written, or has an invalid config.
     """
-    about, tensors = load_checked(path, "brain", FORMAT_VERSION)
+    about, tensors = load_checked(path, "brain", FORMAT_VERSION, whole=5)
+    if not isinstance(about.get("config"), dict):
+        raise CheckpointError(f"{path}: has no config; restore it from a copy")
     try:
         with warnings.catch_warnings(action="ignore", category=RenamedKeyWarning):
-            config = build_config(about.get("config", {}), origin=str(path))
+            config = build_config(about["config"], origin=str(path))
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
     if about["format"] == 1:

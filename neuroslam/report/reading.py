@@ -55,7 +55,7 @@ def read_run(out: str | Path) -> FinishedRun:
     if not out.is_dir():
         what = "is a file" if out.exists() else "no such folder"
         raise RunError(f"{out}: {what}; expected the folder of a run")
-    plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
+    plan, brain = read_plan(out), load_brain(brain_file(out))
     rows = brain.clock.frames_seen
     if brain.sessions.merges and not frame_rows(out, 1):
         rows = 0  # a merge of two brain files, without frames

@@ -12,7 +12,7 @@ from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_summary
 from neuroslam.figures.sessions import Stage, plot_stages
 from neuroslam.figures.style import save
-from neuroslam.runs.files import require_free
+from neuroslam.runs.files import brain_file, require_free
 from neuroslam.runs.reading import odometry_track, read_frames, read_plan, read_trace, trajectory
 from neuroslam.runs.results import RunSummary
 from neuroslam.runs.run import run
@@ -114,7 +114,7 @@ def _draw_sessions(out: Path, summary: RunSummary) -> None:
 def draw_summary(out: str | Path, path: Path) -> None:
     """Draw a run on one sheet: odometry, map, cells, last view, counts over time."""
     out = Path(out)
-    brain, trace, frames = load_brain(out / "brain.safetensors"), read_trace(out), read_frames(out)
+    brain, trace, frames = load_brain(brain_file(out)), read_trace(out), read_frames(out)
     source = open_source(read_plan(out).source)
     last = next(iter(source.frames(int(frames["frame"][-1]))))
     links, cells = brain.map.links, brain.pose_cells

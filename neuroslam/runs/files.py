@@ -1,20 +1,23 @@
 """The files of a run; their names and columns are a contract."""
 
 import contextlib
+import hashlib
 import json
 import math
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, TextIO
+from typing import BinaryIO, Literal
 
 import numpy as np
+from pydantic import ConfigDict
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.errors import RunError, counted
 from neuroslam.mapping.tables import Links
+from neuroslam.runs.manifest import MANIFEST, Extent, check_saved
+from neuroslam.runs.saves import settle
 from neuroslam.state.files import write_atomically
 from neuroslam.types import Frame, StepResult
 
@@ -33,6 +36,9 @@ RUN_FILES = (
     "frames.csv", "trace.f64", "config.toml", "metrics.json", "brain.safetensors",
     "experiences.csv", "links.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
+ROWS = RUN_FILES[:2]
+"""The files with one row per frame."""
+
 LANDMARKS_FILE = "landmarks.csv"
 """Written if the brain has a semantic map; other populations can write tables of their own."""
 
@@ -46,6 +52,8 @@ OnBadFrame = Literal["skip", "stop"]
 @dataclass(frozen=True)
 class RunPlan:
     """The source of a run and the range of its frames: table ``[run]`` of its ``config.toml``."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")  # of what is read
 
     source: str
     start: int = 0
@@ -81,10 +89,17 @@ class RunPlan:
 
 
 def brain_file(path: str | Path) -> Path:
-    """Return the brain file of a run folder, or the path itself if it is no folder."""
+    """Return the brain file of a run folder, or the path itself if it is no folder.
+
+    Raises:
+        RunError: If it is the folder of many runs, or the brain is not that of its last save.
+    """
     path = Path(path)
     refuse_many(path)
-    return path / "brain.safetensors" if path.is_dir() else path
+    if not path.is_dir():
+        return path
+    check_saved(path / "brain.safetensors")
+    return path / "brain.safetensors"
 
 
 def refuse_many(out: Path) -> None:
@@ -93,6 +108,8 @@ def refuse_many(out: Path) -> None:
     Raises:
         RunError: If it is such a folder; the message says where its runs are.
     """
+    if out.is_dir():
+        settle(out)
     if (out / "brain.safetensors").exists() or (out / "frames.csv").exists():
         return
     if (out / "sweep.json").exists():
@@ -116,7 +133,7 @@ def run_files(out: Path) -> tuple[str, ...]:
         own = [name for name in tables if isinstance(name, str) and Path(name).name == name]
     except (OSError, ValueError, KeyError, TypeError):  # no run, or one of an older version
         own = []
-    return (*RUN_FILES, *dict.fromkeys([LANDMARKS_FILE, *own]))
+    return (*RUN_FILES, MANIFEST, *dict.fromkeys([LANDMARKS_FILE, *own]))
 
 
 def require_free(out: Path, source: str, overwrite: bool) -> None:
@@ -137,64 +154,81 @@ def require_free(out: Path, source: str, overwrite: bool) -> None:
 
 
 class RowWriter:
-    """Writes the two files that grow by one row per frame: ``frames.csv`` and ``trace.f64``."""
+    """Writes the two files that grow by one row per frame: ``frames.csv`` and ``trace.f64``.
 
-    def __init__(self, frames: TextIO, trace: BinaryIO) -> None:
-        self.frames, self.trace = frames, trace
+    Attributes:
+        folder: Where they are: in the folder of the run, or beside those of an earlier run until
+            the first save replaces that.
+    """
+
+    def __init__(self, folder: Path, frames: BinaryIO, trace: BinaryIO) -> None:
+        self.folder = folder
+        self.files = dict(zip(ROWS, (frames, trace), strict=True))
+        self._sizes = dict.fromkeys(self.files, 0)
+        self._digests = {name: hashlib.sha256() for name in self.files}
 
     @classmethod
     @contextlib.contextmanager
-    def create(cls, out: Path) -> Iterator["RowWriter"]:
-        """Start the files of a new run; those of an earlier run are removed."""
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            with (out / "frames.csv").open("w") as frames, (out / "trace.f64").open("wb") as trace:
-                _remove_partial_files(out)
-                shutil.rmtree(out / "events", ignore_errors=True)
-                for name in run_files(out)[2:]:  # they belong to the earlier run
-                    (out / name).unlink(missing_ok=True)
-                frames.write(FRAME_COLUMNS + "\n")
-                yield cls(frames, trace)
-        except OSError as error:
-            raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    def create(cls, folder: Path) -> Iterator["RowWriter"]:
+        """Start the files of a new run."""
+        with (folder / "frames.csv").open("wb") as frames, (folder / "trace.f64").open("wb") as t:
+            writer = cls(folder, frames, t)
+            writer._append("frames.csv", (FRAME_COLUMNS + "\n").encode())
+            yield writer
 
     @classmethod
     @contextlib.contextmanager
     def reopen(cls, out: Path, rows: int) -> Iterator["RowWriter"]:
-        """Continue after ``rows`` rows; rows after the last save of a killed run are cut off."""
-        row_bytes = 8 * len(TRACE_COLUMNS)
-        try:
-            with (
-                (out / "frames.csv").open("r+") as frames,
-                (out / "trace.f64").open("r+b") as trace,
-            ):
-                frames.readline()
-                for done in range(rows):
-                    if not is_whole(frames.readline()):
-                        raise RunError(f"{missing_rows(out, done, rows)}; cannot resume")
-                frames.seek(frames.tell())
-                frames.truncate()
-                if trace.seek(0, os.SEEK_END) < rows * row_bytes:
-                    there = trace.tell() // row_bytes
-                    raise RunError(
-                        f"{out}/trace.f64: {counted(there, 'row')}, the brain has seen "
-                        f"{counted(rows, 'frame')}; cannot resume"
-                    )
-                trace.truncate(rows * row_bytes)
-                trace.seek(0, os.SEEK_END)
-                _remove_partial_files(out)
-                yield cls(frames, trace)
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or out}: cannot be opened ({error.strerror or error}); "
-                "cannot resume"
-            ) from None
+        """Continue after ``rows`` rows; rows after the last save of a killed run are cut off.
 
-    def flush(self) -> None:
-        """Write the rows so far to the disk, so that neither a kill nor a power cut loses them."""
-        for file in (self.frames, self.trace):
-            file.flush()
-            os.fsync(file.fileno())
+        Raises:
+            RunError: If a file is missing, has fewer rows, or other rows than were saved.
+        """
+        with contextlib.ExitStack() as stack:
+            try:
+                opened = [stack.enter_context((out / n).open("r+b")) for n in ROWS]
+                writer = cls(out, *opened)
+                writer._continue_after(rows)
+            except OSError as error:
+                raise RunError(
+                    f"{error.filename or out}: cannot be opened ({error.strerror or error}); "
+                    "cannot resume"
+                ) from None
+            yield writer
+
+    def _continue_after(self, rows: int) -> None:
+        frames, trace = self.files.values()
+        self._take(frames.readline(), "frames.csv")
+        for done in range(rows):
+            line = frames.readline()
+            if not is_whole(line.decode(errors="replace")):
+                raise RunError(f"{missing_rows(self.folder, done, rows)}; cannot resume")
+            self._take(line, "frames.csv")
+        n_bytes = rows * 8 * len(TRACE_COLUMNS)
+        if trace.seek(0, os.SEEK_END) < n_bytes:
+            raise RunError(
+                f"{self.folder}/trace.f64: "
+                f"{counted(trace.tell() // (8 * len(TRACE_COLUMNS)), 'row')}, the brain has seen "
+                f"{counted(rows, 'frame')}; cannot resume"
+            )
+        trace.seek(0)
+        self._take(trace.read(n_bytes), "trace.f64")
+        for name in self.files:
+            check_saved(self.folder / name)
+        for name, file in self.files.items():
+            file.seek(self._sizes[name])
+            file.truncate()
+
+    def saved(self) -> dict[str, Extent]:
+        """Write the rows so far to the disk, and return what there is of each file."""
+        for file in self.files.values():
+            if not file.closed:
+                file.flush()
+                os.fsync(file.fileno())
+        return {
+            name: Extent(self._sizes[name], digest.hexdigest())
+            for name, digest in self._digests.items()
+        }
 
     def write(self, r: StepResult, frame: Frame, brain: NavigationBrain) -> None:
         """Append the rows of one frame."""
@@ -207,20 +241,22 @@ class RowWriter:
                 r.cells,
             )
         )
-        self.frames.write(
+        line = (
             f"{r.frame},{motion},{r.view.template},{match},{r.action},{r.experience},{pose},{cells},"
             f"{r.n_templates},{r.n_experiences},{r.n_links}\n"
         )
+        self._append("frames.csv", line.encode())
         truth = frame.truth or (math.nan, math.nan, math.nan)
         row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion, *truth)
-        self.trace.write(np.array(row, dtype="<f8").tobytes())
+        self._append("trace.f64", np.array(row, dtype="<f8").tobytes())
 
+    def _append(self, name: str, row: bytes) -> None:
+        self.files[name].write(row)
+        self._take(row, name)
 
-def _remove_partial_files(out: Path) -> None:
-    """Remove the temporary files of a run that was killed while it wrote."""
-    for name in run_files(out):
-        for partial in out.glob(f".{name}.*.tmp"):
-            partial.unlink(missing_ok=True)
+    def _take(self, row: bytes, name: str) -> None:
+        self._sizes[name] += len(row)
+        self._digests[name].update(row)
 
 
 def experiences_csv(brain: NavigationBrain) -> str:

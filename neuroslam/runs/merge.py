@@ -1,7 +1,5 @@
 """Merging of two finished sessions, given as runs or brain files, into a run folder."""
 
-import shutil
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,15 +9,11 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import RunError
 from neuroslam.merging.match import find_match
 from neuroslam.merging.report import MergeReport
-from neuroslam.runs.files import (
-    FRAME_COLUMNS,
-    RunPlan,
-    brain_file,
-    require_free,
-    run_files,
-)
+from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, brain_file, require_free
+from neuroslam.runs.manifest import copy_saved
 from neuroslam.runs.reading import read_plan
-from neuroslam.runs.results import RunSummary, write_results
+from neuroslam.runs.results import RunSaver, RunSummary, write_results
+from neuroslam.runs.saves import writing
 from neuroslam.threads import limit_threads
 
 _REST_LOOPS = 5000
@@ -142,7 +136,7 @@ def merge_runs(
         if merged is None:
             return None, reports
         plan = replace(_plan_of(second), maps=(str(files[0].resolve()),))
-        return _write(merged, plan, Path(second), out), reports
+        return _write(merged, plan, Path(second), files, out, overwrite), reports
 
 
 def _plan_of(second: str | Path) -> RunPlan:
@@ -150,25 +144,16 @@ def _plan_of(second: str | Path) -> RunPlan:
     return read_plan(path) if path.is_dir() else RunPlan(str(path.resolve()))
 
 
-def _write(brain: NavigationBrain, plan: RunPlan, second: Path, out: Path) -> RunSummary:
-    """Write all files beside the folder first, so that an earlier run in it stays whole."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as name:
-            beside = Path(name)
-            for file, empty in _ROWS.items():
-                if second.is_dir():
-                    shutil.copyfile(second / file, beside / file)
-                else:
-                    (beside / file).write_text(empty)
-            summary = write_results(brain, plan, beside, RunSummary())
-            out.mkdir(exist_ok=True)
-            # The brain first. A file that was not written now belongs to an earlier run.
-            for file in dict.fromkeys(("brain.safetensors", *run_files(out), *run_files(beside))):
-                if (beside / file).exists():
-                    (beside / file).replace(out / file)
-                else:  # it does not fit the new map
-                    (out / file).unlink(missing_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
-    return summary
+def _write(
+    brain: NavigationBrain, plan: RunPlan, second: Path, sources: list[Path], out: Path, over: bool
+) -> RunSummary:
+    """Write a run whose rows are those of the second; an earlier run is kept until all is there."""
+    with writing(out) as folder:
+        for source in sources:
+            require_free(out, str(source.resolve()), over)  # another process may have been faster
+        for file, empty in _ROWS.items():
+            if second.is_dir():
+                copy_saved(second / file, folder.staged / file)
+            else:
+                (folder.staged / file).write_text(empty)
+        return write_results(brain, plan, RunSaver(folder, folder.staged), RunSummary())

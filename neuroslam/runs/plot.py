@@ -16,7 +16,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_activity, plot_map, plot_pose_cells, plot_signals
 from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import plain_text, save, shortened
-from neuroslam.runs.files import RunPlan
+from neuroslam.runs.files import RunPlan, brain_file
 from neuroslam.runs.reading import (
     length_unit,
     odometry_track,
@@ -41,7 +41,7 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
         The files that were written.
     """
     out, to = Path(out), Path(to)
-    plan, brain = read_plan(out), load_brain(out / "brain.safetensors")
+    plan, brain = read_plan(out), load_brain(brain_file(out))
     rows = brain.clock.frames_seen
     trace, frames = read_trace(out, rows), read_frames(out, rows)
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
@@ -23,9 +24,16 @@ from neuroslam.runs.files import (
     missing_rows,
     refuse_many,
 )
+from neuroslam.runs.manifest import check_saved
 from neuroslam.types import NO_EXPERIENCE, Pose
 
-_FIGURES = ("frames", "seconds", "cpu_seconds", "skipped", "merge_reports", "refused_merges")
+_FIGURES: dict[str, Any] = {
+    "frames": int, "seconds": int | float, "cpu_seconds": int | float, "skipped": list,
+    "merge_reports": list, "refused_merges": list,
+}  # fmt: skip
+"""Figures that every run has, and their types."""
+
+_PLAN = TypeAdapter(RunPlan)
 
 
 def read_trace(
@@ -53,6 +61,7 @@ def read_trace(
         raise RunError(
             f"{path}: damaged, {counted(there, 'whole row')}; expected {rows or min_rows}"
         )
+    check_saved(path)
     table = values[: (rows or there) * width].reshape(-1, width)
     return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
 
@@ -129,6 +138,7 @@ def _all_rows(out: str | Path, rows: int | None) -> list[str]:
     lines = frame_rows(out, rows)
     if rows is not None and len(lines) < rows:
         raise RunError(missing_rows(out, len(lines), rows))
+    check_saved(Path(out) / "frames.csv")
     return lines
 
 
@@ -174,7 +184,7 @@ def read_plan(out: str | Path) -> RunPlan:
     Raises:
         RunError: If the folder holds no run.
     """
-    refuse_many(Path(out))
+    refuse_many(Path(out))  # settles it too
     path = Path(out) / "config.toml"
     if (Path(out) / "frames.csv").exists() and not any(
         (Path(out) / name).exists() for name in RUN_FILES[4:]
@@ -184,7 +194,7 @@ def read_plan(out: str | Path) -> RunPlan:
         )
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
-        return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
+        plan = _PLAN.validate_json(json.dumps(table), strict=True)
     except OSError:
         if (Path(out) / "brain.safetensors").exists():
             raise RunError(
@@ -192,8 +202,10 @@ def read_plan(out: str | Path) -> RunPlan:
                 f"{Path(out) / 'brain.safetensors'} alone"
             ) from None
         raise RunError(f"{out}: not a run; expected a folder with config.toml") from None
-    except (KeyError, TypeError, ValueError):  # not TOML, not text, or not the config of a run
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError):  # not TOML, text ...
         raise RunError(f"{path}: has no valid [run] table; expected the config of a run") from None
+    check_saved(path)
+    return plan
 
 
 def read_metrics(out: str | Path) -> dict[str, Any]:
@@ -205,12 +217,14 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     path = Path(out) / "metrics.json"
     try:
         metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        for name in _FIGURES:
-            metrics[name]
+        for name, kind in _FIGURES.items():
+            if not isinstance(metrics[name], kind):
+                raise TypeError(f"{name} is {metrics[name]!r}")
     except FileNotFoundError:
         raise RunError(f"{path}: missing; expected the folder of a run") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RunError(f"{path}: damaged ({error})") from None
+    check_saved(path)
     return metrics
 
 
@@ -251,6 +265,7 @@ def track_file(out: Path) -> Path:
     """
     refuse_many(out)
     track = out / "trajectory.tum"
+    check_saved(track)
     if (
         not track.exists()
         and (out / "brain.safetensors").exists()

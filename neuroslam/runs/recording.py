@@ -1,8 +1,10 @@
 """Recorders that watch a run: TensorBoard, or none; the brain does not depend on them."""
 
+import contextlib
 import math
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -36,6 +38,11 @@ class Recorder(ABC):
     @abstractmethod
     def close(self) -> None:
         """Write what is pending; a second call does nothing."""
+
+    @contextlib.contextmanager
+    def moving_to(self, folder: Path) -> Iterator[None]:
+        """Let the block move the files to ``folder``, where recording continues."""
+        yield
 
     def __enter__(self) -> Self:
         return self
@@ -129,6 +136,16 @@ class TensorBoardRecorder(Recorder):
                 self._write_picture(tag, coloured(activity), result.frame)
         if result.frame % self.maps_every == 0 and result.frame > 0:
             self._write_map(result.frame, brain)
+
+    @contextlib.contextmanager
+    def moving_to(self, folder: Path) -> Iterator[None]:
+        """Close the files, and begin another in ``folder`` after the block."""
+        if str(folder) == self._writer.log_dir:
+            yield
+            return
+        self._writer.close()
+        yield
+        self._writer.log_dir = str(folder)  # a closed writer opens a file there when it needs one
 
     def close(self) -> None:
         """Draw the final map, write the templates for the projector, and close the files."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,18 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, save_brain
 from neuroslam.config import to_toml
-from neuroslam.errors import MapError, RunError
+from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import (
+    ROWS,
     RunPlan,
     experiences_csv,
     links_csv,
+    run_files,
     write_text,
 )
+from neuroslam.runs.manifest import Extent, extent_of, write_manifest
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import (
     odometry_track,
@@ -29,6 +33,7 @@ from neuroslam.runs.reading import (
     unit_of,
 )
 from neuroslam.runs.sanity import is_animal, unit_warnings
+from neuroslam.runs.saves import Folder
 from neuroslam.state.answers import RUN_FIGURES, counts_of, gathered, tables_of
 
 
@@ -89,21 +94,53 @@ class RunSummary:
         }
 
 
+class RunSaver:
+    """Saves a run: everything from which it can be resumed becomes visible together.
+
+    Args:
+        folder: The folder of the run, locked.
+        rows_in: Where the files with one row per frame are: ``folder.out``, or ``folder.staged``
+            until the first save, where it replaces an earlier run.
+    """
+
+    def __init__(self, folder: Folder, rows_in: Path) -> None:
+        self.folder, self.rows_in = folder, rows_in
+        self.rows: Callable[[], dict[str, Extent]] = self._measured_rows
+
+    def _measured_rows(self) -> dict[str, Extent]:
+        return {name: extent_of(self.rows_in / name) for name in ROWS}
+
+    def __call__(self, brain: NavigationBrain, plan: RunPlan, summary: RunSummary) -> None:
+        """Save the run as it is now, with the files that are prepared in the folder already.
+
+        Files of an earlier save that are not part of this one are removed with it.
+        """
+        out, staged = self.folder.out, self.folder.staged
+        write_text(staged / "config.toml", to_toml(brain.config) + plan.to_toml())
+        write_text(staged / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
+        save_brain(brain, staged / "brain.safetensors")
+        write_manifest(staged, self.rows())
+        stale = {*run_files(out), "events"}
+        self.folder.commit(stale.difference((*ROWS, "events") if self.rows_in == out else ()))
+        self.rows_in = out
+
+
 def write_results(
-    brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary
+    brain: NavigationBrain, plan: RunPlan, save: RunSaver, summary: RunSummary
 ) -> RunSummary:
-    """Write the files at the end of a run.
+    """Write the files at the end of a run, and save it.
 
     Args:
         brain: The brain at the end of the run.
         plan: Source and range of the run.
-        out: Folder that holds ``trace.f64``.
+        save: Writes the save; its rows are those of the whole run.
         summary: Summary so far; it is completed and returned.
 
     Raises:
-        RunError: If the folder cannot be written.
+        OSError: If the folder cannot be written.
     """
-    trace = read_trace(out, min_rows=0)
+    save.rows()  # flushes them
+    trace = read_trace(save.rows_in, min_rows=0)
     track = trajectory(brain, trace)
     truth = true_poses(trace)
     odometry = odometry_track(brain.config, trace)
@@ -141,25 +178,15 @@ def write_results(
                     track[known, :2], truth[known, :2], "similarity"
                 ).rmse
             summary.accuracy["frames_with_truth"] = int(known.sum())
-    try:
-        # First what cannot be derived again, so that a run killed now can still be resumed.
-        save_run(brain, plan, out, summary)
-        write_text(out / "experiences.csv", experiences_csv(brain))
-        write_text(out / "links.csv", links_csv(brain.map.links))
-        for name, table in tables.items():
-            write_text(out / name, table)
-        write_tum(out / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
-        draw_map(brain, plan, trace, out / "map.png", unit_of(summary.measured))
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    staged = save.folder.staged
+    write_text(staged / "experiences.csv", experiences_csv(brain))
+    write_text(staged / "links.csv", links_csv(brain.map.links))
+    for name, table in tables.items():
+        write_text(staged / name, table)
+    write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
+    draw_map(brain, plan, trace, staged / "map.png", unit_of(summary.measured))
+    save(brain, plan, summary)
     return summary
-
-
-def save_run(brain: NavigationBrain, plan: RunPlan, out: Path, summary: RunSummary) -> None:
-    """Write the files from which a run can be resumed."""
-    write_text(out / "config.toml", to_toml(brain.config) + plan.to_toml())
-    write_text(out / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
-    save_brain(brain, out / "brain.safetensors")
 
 
 def read_summary(out: Path) -> RunSummary:

@@ -1,8 +1,5 @@
 """A run: a brain maps a source, and the files of the run are written meanwhile."""
 
-import contextlib
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -24,10 +21,19 @@ from neuroslam.config import (
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.runs.clocks import resolve_offset
-from neuroslam.runs.files import OnBadFrame, RowWriter, RunPlan, brain_file, require_free
+from neuroslam.runs.files import (
+    OnBadFrame,
+    RowWriter,
+    RunPlan,
+    brain_file,
+    require_free,
+    run_files,
+)
+from neuroslam.runs.interrupts import noting_interrupts
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
-from neuroslam.runs.results import RunSummary, read_summary, save_run, write_results
+from neuroslam.runs.results import RunSaver, RunSummary, read_summary, write_results
+from neuroslam.runs.saves import writing
 from neuroslam.runs.truth import WithTruth
 from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.axes import parse_axes
@@ -177,21 +183,23 @@ def run(
     with (
         limit_threads(brain.config.threads),
         torch.inference_mode(),
-        _noting_interrupts() as interrupts,
+        noting_interrupts() as interrupts,
     ):
         steps = _steps(brain, opened, plan, summary)
         first = next(steps, None)  # an earlier run is kept if this fails
         if first is None:
             raise RunError(f"{source}: no usable frame{_and_why(summary.skipped)}")
-        with RowWriter.create(out) as output:
-            recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            save = _saver(brain, plan, out, summary, output, save_every_s)
-            _drive(
-                brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
-            )
-        summary.unused = list(opened.unused)
-        summary.notes += [note for note in opened.notes if note not in summary.notes]
-        return write_results(brain, plan, out, summary)
+        with writing(out) as folder:
+            require_free(out, plan.source, overwrite)  # another process may have been faster
+            earlier = any((out / name).exists() for name in run_files(out))
+            save = RunSaver(folder, folder.staged if earlier else out)
+            with RowWriter.create(save.rows_in) as output:
+                recorder = _recorder(save, tensorboard)
+                due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
+                steps = chain([first], steps)
+                _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
+                _note_source(summary, opened)
+                return write_results(brain, plan, save, summary)
 
 
 def _opened(source: str | Path, plan: RunPlan, config: BrainConfig) -> Source:
@@ -242,28 +250,43 @@ def resume(
         CheckpointError: If its brain cannot be loaded.
     """
     out = Path(out)
-    plan = replace(read_plan(out), stop=stop)
-    brain = load_brain(out / "brain.safetensors", features=features)
-    seen, first = brain.clock.frames_seen, brain.clock.frame + 1
-    if stop is not None and stop < first:
-        raise RunError(f"{out}: is at frame {first}; expected --stop of at least that, got {stop}")
-    opened = _opened(plan.source, plan, brain.config)
-    summary = read_summary(out)
-    _announce(on_start, stop, opened)
-    onward = replace(plan, start=max(first, plan.start))
-    with (
-        limit_threads(brain.config.threads),
-        torch.inference_mode(),
-        _noting_interrupts() as interrupts,
-    ):
-        steps = _steps(brain, opened, onward, summary)
-        with RowWriter.reopen(out, seen) as output:
-            recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
-            save = _saver(brain, plan, out, summary, output, save_every_s)
-            _drive(brain, steps, output, recorder, summary, on_step, interrupts, save)
-        summary.unused = list(opened.unused)
-        summary.notes += [note for note in opened.notes if note not in summary.notes]
-        return write_results(brain, plan, out, summary)
+    if not out.is_dir():
+        read_plan(out)  # says what is there instead
+    with writing(out) as folder:
+        plan = replace(read_plan(out), stop=stop)
+        brain = load_brain(brain_file(out), features=features)
+        seen, first = brain.clock.frames_seen, brain.clock.frame + 1
+        if stop is not None and stop < first:
+            raise RunError(
+                f"{out}: is at frame {first}; expected --stop of at least that, got {stop}"
+            )
+        opened = _opened(plan.source, plan, brain.config)
+        summary = read_summary(out)
+        _announce(on_start, stop, opened)
+        onward = replace(plan, start=max(first, plan.start))
+        save = RunSaver(folder, out)
+        with (
+            limit_threads(brain.config.threads),
+            torch.inference_mode(),
+            noting_interrupts() as interrupts,
+            RowWriter.reopen(out, seen) as output,
+        ):
+            steps = _steps(brain, opened, onward, summary)
+            recorder = _recorder(save, tensorboard)
+            due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
+            _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
+            _note_source(summary, opened)
+            return write_results(brain, plan, save, summary)
+
+
+def _recorder(save: RunSaver, tensorboard: bool) -> Recorder:
+    return TensorBoardRecorder(save.rows_in / "events") if tensorboard else NullRecorder()
+
+
+def _note_source(summary: RunSummary, source: Source) -> None:
+    """Note what was found out about a source while it was read."""
+    summary.unused = list(source.unused)
+    summary.notes += [note for note in source.notes if note not in summary.notes]
 
 
 def _announce(
@@ -310,7 +333,7 @@ def _drive(
         summary.cpu_seconds = time.process_time() - cpu
 
     try:
-        with contextlib.closing(recorder):
+        with recorder:
             for frame, result in steps:
                 output.write(result, frame, brain)
                 recorder.step(result, frame, brain)
@@ -334,23 +357,25 @@ def _drive(
 def _saver(
     brain: NavigationBrain,
     plan: RunPlan,
-    out: Path,
+    save: RunSaver,
     summary: RunSummary,
     output: RowWriter,
+    recorder: Recorder,
     every_s: float,
 ) -> Callable[[], None]:
     """Return a function that saves the run in progress when a save is due."""
     saved = time.monotonic()
+    save.rows = output.saved  # every frame that the brain has seen needs its row
 
-    def save() -> None:
+    def save_if_due() -> None:
         nonlocal saved
         if every_s and time.monotonic() - saved >= every_s:
-            output.flush()  # every frame that the brain has seen needs its row
             so_far = replace(summary, frames=brain.clock.frames_seen, interrupted=True)
-            save_run(brain, plan, out, so_far)
+            with recorder.moving_to(save.folder.out / "events"):
+                save(brain, plan, so_far)
             saved = time.monotonic()
 
-    return save
+    return save_if_due
 
 
 def _and_why(skipped: list[str]) -> str:
@@ -359,30 +384,6 @@ def _and_why(skipped: list[str]) -> str:
         if skipped
         else ""
     )
-
-
-@contextlib.contextmanager
-def _noting_interrupts() -> Iterator[list[int]]:
-    """Let Ctrl-C end the run after the current frame, so that brain and files agree.
-
-    A second Ctrl-C interrupts at once. Only the main thread receives signals; where they are
-    ignored, a parent process handles them.
-    """
-    interrupts: list[int] = []
-    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    if ignored or threading.current_thread() is not threading.main_thread():
-        yield interrupts
-        return
-
-    def note(number: int, _frame: object) -> None:
-        interrupts.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield interrupts
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _with_absolute_weights(config: BrainConfig) -> BrainConfig:

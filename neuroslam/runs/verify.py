@@ -23,6 +23,7 @@ from neuroslam.runs.files import (
     links_csv,
     missing_rows,
 )
+from neuroslam.runs.manifest import manifest_faults, read_manifest
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
 from neuroslam.state.answers import gathered, tables_of
 from neuroslam.state.mergeable import State
@@ -75,7 +76,10 @@ def verify(path: str | Path) -> list[str]:
             f"expected {counted(len(numbers), 'row')}, one per stored map"
         )
     if path.is_dir() and not faults:  # files cannot agree with a faulty brain
-        faults = list(_folder_faults(path, model))
+        try:
+            faults = list(_folder_faults(path, model)) or manifest_faults(path)
+        except NeuroslamError as error:  # the manifest is damaged
+            faults = [str(error)]
     return faults
 
 
@@ -230,6 +234,10 @@ def _origin_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
 
 def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
     """Yield the files of a run that differ from its brain, or cannot be read."""
+    saved = read_manifest(out)
+    if saved is not None and "trajectory.tum" not in saved:  # a save during the run
+        yield f"{out}: the run was cut off; continue it with: neuroslam resume {out}"
+        return
     for read in (read_plan, read_metrics):
         try:
             read(out)

@@ -9,7 +9,7 @@ from neuroslam.errors import CheckpointError
 from neuroslam.spiking.slam import SSPSLAM
 from neuroslam.state.files import first_line, load_checked, save_checked
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _KIND = "semantic map"
 
 
@@ -36,7 +36,7 @@ def load_semantic_map(path: str | Path) -> SSPSLAM:
     Raises:
         CheckpointError: If the file cannot be used; one line says why.
     """
-    about, tensors = load_checked(path, _KIND, FORMAT_VERSION)
+    about, tensors = load_checked(path, _KIND, FORMAT_VERSION, whole=2)
     try:
         config = SSPSLAMConfig.model_validate(about["config"])
         slam = SSPSLAM(config, tensors["pointers"], about["names"], about["batch"])

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import struct
 import tempfile
 from collections.abc import Callable
@@ -44,6 +45,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def sync_folder(path: Path) -> None:
+    """Write the names in a folder to the disk, so that a rename outlasts a power cut."""
+    if os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def tensors_digest(tensors: dict[str, Tensor]) -> str:
     """Return the SHA-256 over names, dtypes, shapes and bytes of tensors, in order of name."""
     digest = hashlib.sha256()
@@ -54,7 +66,14 @@ def tensors_digest(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def save_checked(path: str | Path, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+def content_digest(about: dict[str, Any], tensors: dict[str, Tensor]) -> str:
+    """Return the SHA-256 over tensors and all that is known about them but ``sha256`` itself."""
+    known = {name: value for name, value in about.items() if name != "sha256"}
+    text = json.dumps(known, sort_keys=True)
+    return hashlib.sha256(f"{text}{tensors_digest(tensors)}".encode()).hexdigest()
+
+
+def save_checked(path: str | Path, about: dict[str, Any], tensors: dict[str, Tensor]) -> str:
     """Write tensors and what is known about them to one file.
 
     The file is written beside ``path``, flushed to the disk and then renamed: whatever happens,
@@ -64,14 +83,42 @@ def save_checked(path: str | Path, about: dict[str, Any], tensors: dict[str, Ten
         path: Usually ends in ``.safetensors``.
         about: ``format``, a number, and whatever belongs to the kind of file.
         tensors: The state; it is not changed.
+
+    Returns:
+        The digest of the content, which the file holds too.
+
+    Raises:
+        OSError: If it cannot be written.
     """
     tensors = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    text = json.dumps(about | {"sha256": tensors_digest(tensors)}, sort_keys=True)
-    write_atomically(Path(path), lambda file: save_file(tensors, file, metadata={_KEY: text}))
+    digest = content_digest(about, tensors)
+    text = json.dumps(about | {"sha256": digest}, sort_keys=True)
+
+    def write(file: Path) -> None:
+        try:
+            save_file(tensors, file, metadata={_KEY: text})
+        except SafetensorError as error:  # of a disk that is full, for one
+            number = re.search(r"\(os error (\d+)\)", str(error))
+            if number is None:
+                raise
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
+
+    write_atomically(Path(path), write)
+    sync_folder(Path(path).parent)
+    return digest
+
+
+def stored_digest(path: str | Path) -> str:
+    """Read the digest that a file of :func:`save_checked` holds; empty if it is no such file."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return str(json.loads((file.metadata() or {})[_KEY])["sha256"])
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
 
 
 def load_checked(
-    path: str | Path, kind: str, newest: int
+    path: str | Path, kind: str, newest: int, whole: int
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read and check a file: what is known about it, and its tensors.
 
@@ -79,6 +126,8 @@ def load_checked(
         path: The file.
         kind: What it should be, ``"brain"`` or another.
         newest: Highest format that can be read.
+        whole: First format whose digest covers all that is known too; that of older ones covers
+            the tensors only.
 
     Raises:
         CheckpointError: In one line, what is wrong: missing, not such a file, a pickle, truncated,
@@ -99,8 +148,10 @@ def load_checked(
         ) from None
     try:
         about: dict[str, Any] = json.loads(metadata[_KEY])
-        version, digest = int(about["format"]), str(about["sha256"])
-    except (KeyError, ValueError, TypeError):
+        version, digest = about["format"], about["sha256"]
+        if type(version) is not int:
+            raise TypeError(version)
+    except (KeyError, ValueError, TypeError, RecursionError):
         raise CheckpointError(
             f"{path}: a safetensors file, but not one that neuroslam wrote"
         ) from None
@@ -110,7 +161,7 @@ def load_checked(
         raise CheckpointError(
             f"{path}: format {version}, this neuroslam reads up to {newest}; upgrade it"
         )
-    if tensors_digest(tensors) != digest:
+    if digest != (content_digest(about, tensors) if version >= whole else tensors_digest(tensors)):
         raise CheckpointError(
             f"{path}: its content does not match its SHA-256, it was altered or damaged; "
             "restore it from a copy"

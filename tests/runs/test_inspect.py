@@ -10,7 +10,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
@@ -22,7 +21,7 @@ from neuroslam.runs.results import RunSummary
 from neuroslam.runs.run import run
 from neuroslam.runs.verify import verify
 from neuroslam.sensors import open_source
-from neuroslam.state.files import tensors_digest
+from neuroslam.state.files import save_checked, stored_digest
 
 ELLIPSE = "world:ellipse?laps=2&width=256&height=64"
 CORRIDOR = "world:corridor?width=64&height=40&frames_per_lap=60&laps=1"
@@ -58,12 +57,7 @@ def folder(tmp_path_factory):
 
 def save(config, state, file):
     """Write a state as it is, with the digest that it has."""
-    about = {
-        "format": FORMAT_VERSION,
-        "config": config.model_dump(mode="json"),
-        "sha256": tensors_digest(state),
-    }
-    save_file(state, file, metadata={"neuroslam": json.dumps(about)})
+    save_checked(file, {"format": FORMAT_VERSION, "config": config.model_dump(mode="json")}, state)
 
 
 def damaged(file, to, alter) -> list[str]:
@@ -139,7 +133,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     assert told["loop closures"] == "1"  # where the two maps meet
     assert told["frames seen"] == "430"
     assert told["format"] == str(FORMAT_VERSION)
-    assert told["SHA-256"] == tensors_digest(brain.state_dict())
+    assert told["SHA-256"] == stored_digest(file)
     assert told["size"] == f"{joined.stat().st_size} bytes"
     width, height = np.ptp(brain.map.poses[:, :2], axis=0)
     assert told["extent"] == f"{width:.2f} m x {height:.2f} m"
