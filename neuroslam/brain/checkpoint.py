@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
+from neuroslam.brain.soundness import faults_of
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, first_line
 from neuroslam.state.files import load_checked, save_checked
@@ -67,6 +68,10 @@ def load_brain(path: str | Path, *, features: nn.Module | None = None) -> Naviga
     """
     config, tensors = read_checkpoint(path)
     brain = NavigationBrain(config, features=features)
+    faults = faults_of(tensors, brain)
+    if faults:
+        more = f"; {len(faults) - 1} more, see neuroslam verify" if len(faults) > 1 else ""
+        raise CheckpointError(f"{path}: its state does not fit its config ({faults[0]}{more})")
     try:
         brain.load_state_dict(tensors)
     except (RuntimeError, ValueError, KeyError, TypeError) as error:

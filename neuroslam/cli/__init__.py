@@ -32,6 +32,7 @@ from neuroslam.cli.results import (
 )
 from neuroslam.cli.settings import presets_command, tune_command
 from neuroslam.errors import NeuroslamError, RenamedKeyWarning
+from neuroslam.interrupts import raising_interrupts
 
 
 class _Commands(TyperGroup):
@@ -148,7 +149,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if console.is_terminal:
             compiled.announce = lambda: say("compiling, once on this machine: up to half a minute")
-        with _quiet_writers(), _warnings_in_one_line(command):
+        with _quiet_writers(), _warnings_in_one_line(command), raising_interrupts():
             return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except typer.Abort:
         complain(command, "interrupted")

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
+from neuroslam.interrupts import end_runs
 from neuroslam.threads import limit_threads
 
 T = TypeVar("T")
@@ -89,12 +90,22 @@ def outcomes(
         yield from _in_processes(function, numbered, jobs)
 
 
+_SAVING_S = 60.0
+"""Longest time that a run has to save itself after its parent process has ended."""
+
+_idle = threading.Event()
+_idle.set()
+
+
 def _attempt(function: Callable[[T], R], item: T) -> R | NeuroslamError:
-    with limit_threads():
-        try:
+    _idle.clear()
+    try:
+        with limit_threads():
             return function(item)
-        except NeuroslamError as error:
-            return error
+    except NeuroslamError as error:
+        return error
+    finally:
+        _idle.set()
 
 
 # --- processes of this machine ------------------------------------------------------------------
@@ -142,11 +153,13 @@ def _workers(n: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _start_worker(lifeline: Connection) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent closes its end of the pipe."""
+    """Leave Ctrl-C to the parent; when it closes its end of the pipe, save the run and end."""
 
     def end_with_parent() -> None:
         with contextlib.suppress(EOFError, OSError):
             lifeline.recv()
+        if end_runs():
+            _idle.wait(_SAVING_S)
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -20,6 +20,7 @@ from neuroslam.config import (
     read_preset,
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
+from neuroslam.interrupts import noting_interrupts
 from neuroslam.runs.clocks import resolve_offset
 from neuroslam.runs.files import (
     OnBadFrame,
@@ -29,7 +30,6 @@ from neuroslam.runs.files import (
     require_free,
     run_files,
 )
-from neuroslam.runs.interrupts import noting_interrupts
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.recording import NullRecorder, Recorder, TensorBoardRecorder
 from neuroslam.runs.results import RunSaver, RunSummary, read_summary, write_results

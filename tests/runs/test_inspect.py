@@ -133,7 +133,7 @@ def test_the_table_of_a_brain_lists_its_content(joined):
     assert told["loop closures"] == "1"  # where the two maps meet
     assert told["frames seen"] == "430"
     assert told["format"] == str(FORMAT_VERSION)
-    assert told["SHA-256"] == stored_digest(file)
+    assert told["SHA-256"] == stored_digest(joined)
     assert told["size"] == f"{joined.stat().st_size} bytes"
     width, height = np.ptp(brain.map.poses[:, :2], axis=0)
     assert told["extent"] == f"{width:.2f} m x {height:.2f} m"

@@ -61,14 +61,17 @@ def handling(handler: object, signals: tuple[signal.Signals, ...] = SIGNALS) -> 
             signal.signal(number, was)
 
 
-def end_runs() -> None:
+def end_runs() -> bool:
     """Let the runs in progress end after their current frames, as a signal would; any thread may.
+
+    Returns:
+        Whether there are any.
 
     Example:
         >>> with noting_interrupts() as interrupts:
-        ...     end_runs()
-        >>> bool(interrupts)
-        True
+        ...     end_runs(), bool(interrupts)
+        (True, True)
     """
     for interrupts in list(_running):
         interrupts.append(0)
+    return bool(_running)
