@@ -4,20 +4,23 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import fields
 
 import numpy as np
+from pydantic import TypeAdapter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import counted, listed
+from neuroslam.errors import counted, first_line, listed
 from neuroslam.mapping.tables import Links, origin_key
+from neuroslam.merging.report import MergeReport
 from neuroslam.state.mergeable import State
 from neuroslam.state.registry import leading_class, population_classes
-from neuroslam.state.sessions import Session, session_name
+from neuroslam.state.sessions import ID_BITS, Session, session_name
 from neuroslam.state.tables import GrowingTable
+
+_SESSIONS = TypeAdapter(list[Session])
 
 _MAY_BE_INFINITE = ("map.goals.until_s",)  # a goal without an end time
 
@@ -43,7 +46,11 @@ def faults_of(state: State, model: NavigationBrain) -> list[str]:
         faults.append(f"stored maps are numbered {sorted(numbers)}; expected 0, 1, ...")
     if faults:
         return faults  # other checks need complete tensors
-    faults = [f"{where}{fault}" for where, part in parts for fault in _faults(part, model.config)]
+    for where, part in parts:
+        try:
+            faults += [f"{where}{fault}" for fault in _faults(part, model.config)]
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            faults.append(f"{where}cannot be checked ({first_line(error)})")
     tallies = len(state["recognition.tally.alike"])
     if tallies != len(numbers):
         faults.append(
@@ -81,13 +88,26 @@ def _misfits(state: State, model: NavigationBrain) -> Iterator[str]:
         if len(set(lengths.values())) > 1:
             each = ", ".join(f"{name} {length[0]}" for name, length in lengths.items() if length)
             yield f"{table}: columns of different lengths: {each}"
+    fault = _log_fault(state)
+    if fault:
+        yield f"sessions.text: {fault}"
+
+
+def _log_fault(state: State) -> str:
+    """Return why the log is not one of sessions and merges; empty if it is."""
     try:
-        log = json.loads(bytes(state["sessions.text"].tolist()) or b'{"sessions": []}')
-        wrong = [s for s in log["sessions"] if {f.name for f in fields(Session)} != s.keys()]
-    except (KeyError, ValueError, TypeError, AttributeError):
-        wrong = ["no list"]
-    if wrong:
-        yield "sessions.text: not a log of sessions"
+        log = json.loads(bytes(state["sessions.text"].tolist()) or b"{}")
+        rows = log.get("sessions", [])
+        sessions = _SESSIONS.validate_json(json.dumps(rows), strict=True)
+        if any(row.keys() != vars(one).keys() for row, one in zip(rows, sessions, strict=True)):
+            raise ValueError("a session has other keys")
+        if any(one.id >> ID_BITS for one in sessions):
+            raise ValueError("an id is too long, or negative")
+        for report in (*log.get("merges", ()), *log.get("refusals", ())):
+            MergeReport(**report).lines()
+    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
+        return "not a log of sessions and their merges"
+    return ""
 
 
 def _faults(state: State, config: BrainConfig) -> Iterator[str]:

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ from neuroslam.runs.files import OnBadFrame, RunPlan, brain_file, require_free, 
 from neuroslam.runs.merge import merge_runs
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.reading import read_trace, trajectory, true_poses
-from neuroslam.runs.sweep import claim, figures, run_one
+from neuroslam.runs.sweep import claimed, figures, run_one
 from neuroslam.sensors.open import absolute_spec
 
 REPORT = "fleet.json"
@@ -129,36 +128,37 @@ def fleet(
     out = Path(out).resolve()
     if len(sources) < 2:
         raise RunError(f"fleet: got {counted(len(sources), 'source')}; expected at least 2")
-    claim(out, REPORT, overwrite)
-    digits = len(str(len(sources)))
-    orders = [
-        _Session(
-            absolute_spec(str(source)), out / "sessions" / f"{number:0{digits}d}",
-            config or BrainConfig(), preset, on_bad_frame,
-        )
-        for number, source in enumerate(sources, start=1)
-    ]  # fmt: skip
-    for order in orders:
-        require_free(order.folder, order.source, overwrite)
-    if not overwrite and any((out / name).exists() for name in ("merges", MERGED)):
-        raise RunError(
-            f"{out}: holds merges of a fleet already; choose another folder or use --overwrite"
-        )
-    for name in ("merges", MERGED):  # of an earlier fleet, with other sessions
-        shutil.rmtree(out / name, ignore_errors=True)
-    (out / REPORT).unlink(missing_ok=True)
-    report = FleetReport()
-    found = _collect(_map, orders, jobs, ray, "sessions", on_done)
-    for number, (order, outcome) in enumerate(zip(orders, found, strict=True), start=1):
-        row = {"session": number, "source": str(sources[number - 1])}
-        folder = str(order.folder.relative_to(out))
-        report.sessions.append(row | {"folder": folder} | figures(outcome, order.folder))
-    parts = [Part(row["folder"], (row["session"],)) for row in report.sessions if not row["error"]]
-    parts = _merge_all(parts, out, report, jobs, ray, on_done)
-    try:
-        _conclude(parts, out, report)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    with claimed(out, REPORT, overwrite) as (folder, inside):
+        digits = len(str(len(sources)))
+        orders = [
+            _Session(
+                absolute_spec(str(source)), inside / "sessions" / f"{number:0{digits}d}",
+                config or BrainConfig(), preset, on_bad_frame,
+            )
+            for number, source in enumerate(sources, start=1)
+        ]  # fmt: skip
+        for order in orders:
+            require_free(order.folder, order.source, overwrite)
+        if inside == out:
+            if not overwrite and any((out / name).exists() for name in ("merges", MERGED)):
+                raise RunError(
+                    f"{out}: holds merges of a fleet already; choose another folder or use "
+                    "--overwrite"
+                )
+            for name in ("merges", MERGED):  # of a fleet that was cut off
+                shutil.rmtree(out / name, ignore_errors=True)
+        report = FleetReport()
+        found = _collect(_map, orders, jobs, ray, "sessions", on_done)
+        for number, (order, outcome) in enumerate(zip(orders, found, strict=True), start=1):
+            row = {"session": number, "source": str(sources[number - 1])}
+            name = str(order.folder.relative_to(inside))
+            report.sessions.append(row | {"folder": name} | figures(outcome, order.folder))
+        parts = [
+            Part(row["folder"], (row["session"],)) for row in report.sessions if not row["error"]
+        ]
+        parts = _merge_all(parts, inside, report, jobs, ray, on_done)
+        _conclude(parts, inside, folder.staged, report)
+        folder.commit(() if inside == out else ("sessions", "merges", MERGED, "fleet.png"))
     return report
 
 
@@ -244,13 +244,20 @@ def _pairs(free: Sequence[Part], tried: set[tuple[Part, Part]]) -> Iterator[tupl
                 yield pair
 
 
-def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
-    """Copy the largest map to ``merged``, measure it, list the maps apart, and draw."""
+def _conclude(parts: list[Part], out: Path, to: Path, report: FleetReport) -> None:
+    """Copy the largest map to ``merged``, measure it, list the maps apart, and draw.
+
+    Args:
+        parts: The maps that are left.
+        out: Folder of the sessions and merges.
+        to: Folder to write.
+        report: The report, which is completed.
+    """
     most = max(parts, key=lambda part: len(part.sessions), default=None)
     stages, made = [], set()
     if most is not None and len(most.sessions) > 1:
-        _copy(out / most.folder, out / MERGED)
-        brain = load_brain(out / MERGED / "brain.safetensors")
+        shutil.copytree(out / most.folder, to / MERGED)
+        brain = load_brain(brain_file(to / MERGED))
         report.merged = {
             "folder": MERGED,
             "made_in": most.folder,
@@ -286,8 +293,8 @@ def _conclude(parts: list[Part], out: Path, report: FleetReport) -> None:
         if len(report.sessions) > len(SESSIONS):
             title += f"; colours repeat after {len(SESSIONS)} sessions"
         figure = plot_stages([stage for _, stage in stages], title, _names(report, made))
-        save(figure, out / "fleet.png")
-    write_text(out / REPORT, text)
+        save(figure, to / "fleet.png")
+    write_text(to / REPORT, text)
 
 
 def _names(report: FleetReport, made: set[int]) -> list[str]:
@@ -298,13 +305,6 @@ def _names(report: FleetReport, made: set[int]) -> list[str]:
         without = "failed" if row["error"] else "no experience of its own"
         names.append(name if row["session"] in made else f"{name}, {without}")
     return names
-
-
-def _copy(source: Path, to: Path) -> None:
-    """Copy a folder, whole or not at all."""
-    with tempfile.TemporaryDirectory(prefix=f".{to.name}.", dir=to.parent) as name:
-        shutil.copytree(source, Path(name) / to.name)
-        (Path(name) / to.name).replace(to)
 
 
 def _measure(brain: NavigationBrain, part: Part, out: Path, report: FleetReport) -> None:

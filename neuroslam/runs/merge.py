@@ -13,7 +13,7 @@ from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, brain_file, require_fre
 from neuroslam.runs.manifest import copy_saved
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.results import RunSaver, RunSummary, write_results
-from neuroslam.runs.saves import writing
+from neuroslam.runs.saves import final, writing
 from neuroslam.threads import limit_threads
 
 _REST_LOOPS = 5000
@@ -135,7 +135,7 @@ def merge_runs(
         merged, reports = join_brains(loaded, partial)
         if merged is None:
             return None, reports
-        plan = replace(_plan_of(second), maps=(str(files[0].resolve()),))
+        plan = replace(_plan_of(second), maps=(str(final(files[0].resolve())),))
         return _write(merged, plan, Path(second), files, out, overwrite), reports
 
 

@@ -55,12 +55,7 @@ class Folder:
         staged = self.staged
         new = {path.name for path in staged.iterdir()}
         (staged / _REMOVED).write_text(json.dumps(sorted(set(remove) - new)), encoding="utf-8")
-        for path in (staged, *staged.rglob("*")):
-            if path.is_dir():
-                sync_folder(path)
-            else:
-                with path.open("rb") as file:
-                    os.fsync(file.fileno())
+        _sync(staged)
         staged.rename(self.out / COMMITTED)
         sync_folder(self.out)
         _install(self.out)
@@ -209,8 +204,34 @@ def _removed(path: Path) -> list[str]:
     ]
 
 
+def _sync(folder: Path) -> None:
+    """Write a folder to the disk, but for runs in it: they are there since they were saved."""
+    for path in folder.iterdir():
+        if not path.is_dir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+        elif not (path / _LAST).exists():
+            _sync(path)
+    sync_folder(folder)
+
+
 def _discard(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
+    if not path.is_dir() or path.is_symlink():
         path.unlink(missing_ok=True)
+        return
+    for _ in range(100):  # a process whose parent was killed may still write there
+        shutil.rmtree(path, ignore_errors=True)
+        if not path.exists():
+            return
+        time.sleep(0.02)
+    shutil.rmtree(path)
+
+
+def final(path: Path) -> Path:
+    """Return where a path will be once the save that it is prepared in is committed.
+
+    Example:
+        >>> final(Path("out/.saving/sessions/1")).as_posix()
+        'out/sessions/1'
+    """
+    return Path(*(part for part in path.parts if part != STAGED))

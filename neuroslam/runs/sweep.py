@@ -6,8 +6,8 @@ import itertools
 import json
 import re
 import tomllib
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from neuroslam.figures.sweep import plot_sweep
 from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.run import resolve_config, run
+from neuroslam.runs.saves import Folder, writing
 from neuroslam.sensors.open import absolute_spec, seeded_spec
 from neuroslam.state.answers import RUN_FIGURES
 
@@ -240,43 +241,51 @@ def sweep(
     trials = plan_sweep(sources, vary, seeds, preset, config, assignments)
     if start < 0 or (stop is not None and stop <= start):
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
-    claim(out, SUMMARY, overwrite)
-    for trial in trials:
-        require_free(out / trial.name, trial.source, overwrite)
-    orders = [_Order(trial, out, preset or "", start, stop, on_bad_frame) for trial in trials]
-    found: dict[int, dict[str, Any]] = {}
-    try:
-        with closing(outcomes(_map, orders, jobs, ray)) as each:
-            for number, outcome in each:
-                found[number] = figures(outcome, out / trials[number].name)
-                if on_done is not None:
-                    on_done(len(found), len(trials))
-    finally:
-        rows = [
-            {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
-            for k, trial in enumerate(trials)
+    with claimed(out, SUMMARY, overwrite) as (folder, inside):
+        for trial in trials:
+            require_free(inside / trial.name, trial.source, overwrite)
+        orders = [
+            _Order(trial, inside, preset or "", start, stop, on_bad_frame) for trial in trials
         ]
-        if found:
-            _write(out, rows, [key for key in varied(rows) if key not in ("run", "seed")])
+        found: dict[int, dict[str, Any]] = {}
+        try:
+            with closing(outcomes(_map, orders, jobs, ray)) as each:
+                for number, outcome in each:
+                    found[number] = figures(outcome, inside / trials[number].name)
+                    if on_done is not None:
+                        on_done(len(found), len(trials))
+        finally:
+            rows = [
+                {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})
+                for k, trial in enumerate(trials)
+            ]
+            if found:
+                keys = [key for key in varied(rows) if key not in ("run", "seed")]
+                _write(folder.staged, rows, keys)
+                folder.commit(("sweep.png",))
     return rows
 
 
-def claim(out: Path, summary: str, overwrite: bool) -> None:
-    """Create the folder of many runs.
+@contextmanager
+def claimed(out: Path, summary: str, overwrite: bool) -> Iterator[tuple[Folder, Path]]:
+    """Lock the folder of many runs.
+
+    Yields:
+        The folder, and where the runs are made: in it, or beside those of an earlier summary until
+        the next save replaces them.
 
     Raises:
-        RunError: If it holds a summary already, is a file or cannot be created.
+        RunError: If it holds a summary already, is a file, cannot be written or is in use.
     """
     if out.exists() and not out.is_dir():
         raise RunError(f"{out}: is a file; expected a folder")
-    if (out / summary).exists() and not overwrite:
-        raise RunError(
-            f"{out}: holds a {summary} already; choose another folder or use --overwrite"
-        )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    with writing(out) as folder:
+        earlier = (out / summary).exists()
+        if earlier and not overwrite:
+            raise RunError(
+                f"{out}: holds a {summary} already; choose another folder or use --overwrite"
+            )
+        yield folder, folder.staged if earlier else out
 
 
 def _map(order: _Order) -> dict[str, Any]:
@@ -347,13 +356,10 @@ def _write(out: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:
     for row in rows:
         table.writerow({key: _written(value) for key, value in row.items()})
     summary = {"varied": keys, "runs": rows}
-    try:
-        write_text(out / "sweep.csv", text.getvalue())
-        write_text(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
-        if any("experiences" in row for row in rows):
-            save(plot_sweep(rows, keys), out / "sweep.png")
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    write_text(out / "sweep.csv", text.getvalue())
+    write_text(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+    if any("experiences" in row for row in rows):
+        save(plot_sweep(rows, keys), out / "sweep.png")
 
 
 def _written(value: object) -> str:

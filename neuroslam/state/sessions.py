@@ -13,7 +13,7 @@ from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.pickling import Calls
 
-_ID_BITS = 40
+ID_BITS = 40
 
 
 @dataclass
@@ -73,7 +73,7 @@ def session_id(*parts: object) -> int:
         else:
             digest.update(repr(part).encode())
         digest.update(b";")
-    return int.from_bytes(digest.digest()[:8], "big") >> (64 - _ID_BITS)
+    return int.from_bytes(digest.digest()[:8], "big") >> (64 - ID_BITS)
 
 
 class SessionLog(Mergeable):

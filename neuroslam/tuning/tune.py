@@ -16,6 +16,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.style import save
 from neuroslam.figures.tuning import plot_tuning
 from neuroslam.runs.files import write_text
+from neuroslam.runs.saves import writing
 from neuroslam.sensors import Source, open_source
 from neuroslam.state.registry import leading_class
 from neuroslam.threads import limit_threads
@@ -164,8 +165,7 @@ def tune(
         raise RunError(f"stop is {stop}; expected 1 or more")
     if out.exists() and not out.is_dir():
         raise RunError(f"{out}: is a file; expected a folder to write")
-    if (out / "config.toml").exists() and not overwrite:
-        raise RunError(f"{out}: holds a config.toml already; take another folder or --overwrite")
+    _require_free(out, overwrite)
     opened = open_source(source, config.frame_rate_hz, config.view.grey)
     if opened.live:
         raise RunError(
@@ -176,14 +176,18 @@ def tune(
         tuning = _tune(opened, config, stop, report, features)
         tuning.notes[:0] = opened.notes
         figure = plot_tuning(tuning, opened.name)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        save(figure, out / "tune.png")
-        write_text(out / "tune.json", json.dumps(tuning.to_dict(), indent=2) + "\n")
-        write_text(out / "config.toml", to_toml(tuning.config))
-    except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+    with writing(out) as folder:
+        _require_free(out, overwrite)  # another process may have been faster
+        save(figure, folder.staged / "tune.png")
+        write_text(folder.staged / "tune.json", json.dumps(tuning.to_dict(), indent=2) + "\n")
+        write_text(folder.staged / "config.toml", to_toml(tuning.config))
+        folder.commit()
     return tuning
+
+
+def _require_free(out: Path, overwrite: bool) -> None:
+    if (out / "config.toml").exists() and not overwrite:
+        raise RunError(f"{out}: holds a config.toml already; take another folder or --overwrite")
 
 
 def _tune(

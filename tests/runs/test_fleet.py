@@ -11,6 +11,7 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
 from neuroslam.runs.files import RUN_FILES, TIMINGS
 from neuroslam.runs.fleet import FleetReport, Part, _names, _pairs, fleet
+from neuroslam.runs.manifest import MANIFEST
 from neuroslam.state.files import tensors_digest
 
 LOOK = "width=128&height=32"
@@ -71,7 +72,7 @@ def test_matching_maps_become_one_and_the_others_have_a_reason(done):
 
 def test_the_merged_map_is_the_folder_of_a_merge(done, call):
     out, report = done
-    assert {path.name for path in (out / "merged").iterdir()} == set(RUN_FILES)
+    assert {path.name for path in (out / "merged").iterdir()} == {*RUN_FILES, MANIFEST}
     assert call("verify", out / "merged").code == 0
     brain = load_brain(out / "merged" / "brain.safetensors")
     alone = [load_brain(out / "sessions" / str(k) / "brain.safetensors") for k in (1, 2, 3, 4)]

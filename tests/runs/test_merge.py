@@ -20,6 +20,7 @@ from neuroslam.cli import main
 from neuroslam.merging.report import MergeReport
 from neuroslam.runs import plot
 from neuroslam.runs.files import RUN_FILES, RunPlan
+from neuroslam.runs.manifest import MANIFEST
 from neuroslam.runs.reading import read_frames
 
 WORLD = "world:ellipse?laps=2&width=128&height=32"
@@ -90,7 +91,7 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
     assert (done.code, done.err) == (0, "")
     assert re.search(r"^merged: \d+ experiences are new$", done.out, re.MULTILINE)
     assert done.out.endswith(f"Written: {out}\n")
-    assert {path.name for path in out.iterdir()} == set(RUN_FILES)
+    assert {path.name for path in out.iterdir()} == {*RUN_FILES, MANIFEST}
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     assert (contents(runs / "a"), contents(runs / "b")) == before
 

@@ -17,6 +17,7 @@ from neuroslam import load_brain
 from neuroslam.errors import ConfigError, NeuroslamError, RunError, SourceError
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.runs.files import RUN_FILES, TIMINGS
+from neuroslam.runs.manifest import MANIFEST
 from neuroslam.runs.sweep import parse_values, plan_sweep, sweep, varied
 from neuroslam.sensors.open import seeded_spec
 from neuroslam.state.files import tensors_digest
@@ -37,6 +38,9 @@ def all_but_timings(folder: Path) -> dict[str, object]:
         if path.name == "metrics.json":
             figures = json.loads(path.read_text())
             found[name] = {key: v for key, v in figures.items() if key not in TIMINGS}
+        elif path.name == MANIFEST:
+            files = json.loads(path.read_text())["files"]
+            found[name] = {key: v for key, v in files.items() if key != "metrics.json"}
         elif path.name == "sweep.json":
             runs = json.loads(path.read_text())["runs"]
             found[name] = [{k: v for k, v in row.items() if k not in TIMINGS} for row in runs]
@@ -138,7 +142,7 @@ def test_each_run_is_a_folder_like_that_of_any_run(serial, tmp_path, call):
     out, rows = serial
     folders = sorted(path.name for path in out.iterdir() if path.is_dir())
     assert folders == [row["run"] for row in rows]
-    assert {path.name for path in (out / folders[0]).iterdir()} == set(RUN_FILES)
+    assert {path.name for path in (out / folders[0]).iterdir()} == {*RUN_FILES, MANIFEST}
     source = f"{WORLD}&seed=1"
     single = call("run", source, "-o", tmp_path / "one", "--stop", STOP, "--no-tensorboard",
                   "--set", "view.threshold=0.06")  # fmt: skip
