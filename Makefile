@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench bench-check lint format notebooks clean
+.PHONY: demo test bench bench-check faults lint format notebooks clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -24,6 +24,11 @@ bench: $(VENV)/.installed
 # Fails if a row of the table takes 15 % longer, in Y, than in benchmarks/last.json.
 bench-check: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.table --check
+
+# Kills, full disks, two writers, damaged and crafted inputs: the tables of docs/reliability.md.
+faults: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.faults
+	$(BIN)/python -m benchmarks.fuzz
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
