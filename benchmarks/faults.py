@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuroslam.cli import main
+from neuroslam.interrupts import raising_interrupts
 from neuroslam.threads import limit_threads
 
 SEED = 18
@@ -325,7 +326,7 @@ def full_disks(base: Path, tally: Tally, n: int) -> None:
     """Run every command on disks of growing size, from none to what it needs."""
     for name, command in COMMANDS.items():
         for k in range(n):
-            size = 4096 * (1 + k * k // 2)  # 4 kB to 0.7 MB
+            size = 4096 * (1 + (k * SIZES // n) ** 2 // 2)  # 4 kB to 0.7 MB
             try:
                 with copies(base, command, size) as folder:
                     out = folder / command.out
@@ -428,7 +429,8 @@ def campaign(scale: float = 1.0, only: str = "") -> Tally:
         for part, go in parts.items():
             if only in part:
                 began = time.monotonic()
-                go(Path(name))
+                with contextlib.suppress(KeyboardInterrupt), raising_interrupts():
+                    go(Path(name))  # an end before the end shows what there is
                 print(f"{part}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     return tally
 

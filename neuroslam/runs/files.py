@@ -160,8 +160,8 @@ class RowWriter:
 
     def __init__(self, folder: Path, frames: BinaryIO, trace: BinaryIO) -> None:
         self.folder = folder
-        self.files = dict(zip(ROWS, (frames, trace), strict=True))
-        self._sizes = dict.fromkeys(self.files, 0)
+        self.files: dict[str, BinaryIO] = dict(zip(ROWS, (frames, trace), strict=True))
+        self._sizes: dict[str, int] = dict.fromkeys(self.files, 0)
         self._digests = {name: hashlib.sha256() for name in self.files}
 
     @classmethod
