@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from neuroslam.cli.options import (
     Assignments,
@@ -29,6 +28,7 @@ from neuroslam.cli.options import (
 )
 from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
 from neuroslam.cli.progress import show_frames
+from neuroslam.cli.tables import Table
 from neuroslam.errors import counted
 
 if TYPE_CHECKING:

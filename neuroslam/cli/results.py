@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.table import Table
 
 from neuroslam.cli.options import Axes, Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
-from neuroslam.cli.tables import new_table
-from neuroslam.errors import RunError, counted
+from neuroslam.cli.tables import Table, new_table
+from neuroslam.errors import RunError, counted, printable
 
 if TYPE_CHECKING:
     from neuroslam.evaluation.trajectory import AlignmentMode
@@ -183,7 +182,9 @@ def evaluate_command(
     if against is not None and truth is not None:
         raise RunError("--against: compares two maps, --truth a trajectory; give one of them")
     if against is not None:
-        table = Table(title=f"Experiences of {track} aligned with those of {against} by ICP")
+        table = Table(
+            title=printable(f"Experiences of {track} aligned with those of {against} by ICP")
+        )
         for column in ("alignment", "RMSE (m)", "of the diagonal (%)", "rotation (°)", "scale"):
             table.add_column(column, justify="left" if column == "alignment" else "right")
         rows, figure = compare_maps(track, against, to)
@@ -200,7 +201,7 @@ def evaluate_command(
         return 0
 
     how = f", {align} alignment" if align else ""
-    table = Table(title=f"{track} and ground truth{how}")
+    table = Table(title=printable(f"{track} and ground truth{how}"))
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []

@@ -1,6 +1,5 @@
 """Questions to the semantic map of a run, a brain file, or a map of its own."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from safetensors import SafetensorError, safe_open
 from neuroslam.brain import load_brain
 from neuroslam.errors import RunError
 from neuroslam.figures.answers import plot_answer
+from neuroslam.limits import parse_json
 from neuroslam.runs.files import brain_file
 from neuroslam.sensors.landmarks import read_landmarks
 from neuroslam.spiking.ask import Answer, ask
@@ -68,7 +68,7 @@ class AskedMap:
 def _is_semantic_map(file: Path) -> bool:
     try:
         with safe_open(file, framework="pt") as opened:
-            about = json.loads((opened.metadata() or {}).get("neuroslam", "{}"))
+            about = parse_json((opened.metadata() or {}).get("neuroslam", "{}"))
     except (OSError, SafetensorError, ValueError):  # load_brain says why
         return False
     return isinstance(about, dict) and about.get("kind") == "semantic map"

@@ -1,8 +1,6 @@
 """Readers for the files of a run: rows, plan, figures, and the pose of every frame."""
 
-import json
 import math
-import tomllib
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,15 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, counted
 from neuroslam.geometry import compose_poses, integrate_velocities
+from neuroslam.limits import (
+    MOST_CONFIG_BYTES,
+    MOST_JSON_BYTES,
+    fits,
+    parse_json,
+    parse_toml,
+    read_bounded,
+    too_much,
+)
 from neuroslam.mapping.tables import origin_key
 from neuroslam.runs.files import (
     FRAME_COLUMNS,
@@ -45,6 +52,8 @@ def read_trace(
     path = Path(out) / "trace.f64"
     if not path.is_file():
         raise RunError(f"{path}: missing; expected the folder of a run")
+    if not fits(needed := 4 * path.stat().st_size):
+        raise RunError(f"{path}: {too_much(needed)}")
     values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
     there = len(values) // width
     if not path.stat().st_size and (rows or min_rows):
@@ -183,8 +192,7 @@ def read_plan(out: str | Path) -> RunPlan:
             f"{out}: the run was cut off before its first save; run again with --overwrite"
         )
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
-        return RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
+        return _checked_plan(parse_toml(read_bounded(path, MOST_CONFIG_BYTES).decode())["run"])
     except OSError:
         if (Path(out) / "brain.safetensors").exists():
             raise RunError(
@@ -196,6 +204,25 @@ def read_plan(out: str | Path) -> RunPlan:
         raise RunError(f"{path}: has no valid [run] table; expected the config of a run") from None
 
 
+def _checked_plan(table: dict[str, Any]) -> RunPlan:
+    """Return the plan of a table ``[run]``.
+
+    Raises:
+        TypeError: If a value is of another type.
+        ValueError: If a frame is negative, or ``on_bad_frame`` is neither stop nor skip.
+    """
+    plan = RunPlan(**table | {"maps": tuple(table.get("maps", ()))})
+    texts = (plan.source, plan.truth, plan.axes, *plan.maps)
+    frames = (plan.start, 0 if plan.stop is None else plan.stop)
+    if not (isinstance(table.get("maps", []), list) and all(isinstance(t, str) for t in texts)):
+        raise TypeError("maps")
+    if not all(type(n) is int for n in frames):
+        raise TypeError("start")
+    if min(frames) < 0 or plan.on_bad_frame not in ("stop", "skip"):
+        raise ValueError("start")
+    return plan
+
+
 def read_metrics(out: str | Path) -> dict[str, Any]:
     """Read the figures of a run.
 
@@ -204,7 +231,7 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     """
     path = Path(out) / "metrics.json"
     try:
-        metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        metrics: dict[str, Any] = parse_json(read_bounded(path, MOST_JSON_BYTES))
         for name in _FIGURES:
             metrics[name]
     except FileNotFoundError:

@@ -34,7 +34,7 @@ from neuroslam.sensors.axes import parse_axes
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
-from neuroslam.threads import limit_threads
+from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -175,7 +175,7 @@ def run(
         brain.store(one)
     _announce(on_start, stop, opened)
     with (
-        limit_threads(brain.config.threads),
+        limit_threads(usable_threads(brain.config.threads)),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):
@@ -252,7 +252,7 @@ def resume(
     _announce(on_start, stop, opened)
     onward = replace(plan, start=max(first, plan.start))
     with (
-        limit_threads(brain.config.threads),
+        limit_threads(usable_threads(brain.config.threads)),
         torch.inference_mode(),
         _noting_interrupts() as interrupts,
     ):

@@ -5,7 +5,6 @@ import io
 import itertools
 import json
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from neuroslam.config.populations import section_class
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
+from neuroslam.limits import parse_toml
 from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.run import resolve_config, run
@@ -74,8 +74,8 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
     """
     key, _, raw = (part.strip() for part in text.partition("="))
     try:
-        values = tomllib.loads(f"values = [{raw}]")["values"]
-    except tomllib.TOMLDecodeError:
+        values = parse_toml(f"values = [{raw}]")["values"]
+    except ValueError:
         values = [part.strip() for part in raw.split(",")]
     if not key or not values or "" in values:
         raise ConfigError(
