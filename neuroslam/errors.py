@@ -54,6 +54,26 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else _escaped(c) for c in text)
 
 
+def csv_text(text: str) -> str:
+    """Return a cell of a CSV table that no spreadsheet takes for a formula.
+
+    A text that starts with ``=``, ``+``, ``-``, ``@`` or a control character gets an apostrophe in
+    front; a number stays as it is.
+
+    Example:
+        >>> csv_text("=1+1.csv"), csv_text("-0.5"), csv_text("drive.avi")
+        ("'=1+1.csv", '-0.5', 'drive.avi')
+    """
+    text = printable(text)
+    if not text.startswith(("=", "+", "-", "@")):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
 def _escaped(character: str) -> str:
     code = ord(character)
     if 0xDC80 <= code <= 0xDCFF:  # a byte that is not UTF-8, as os.fsdecode writes it

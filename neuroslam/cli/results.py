@@ -74,12 +74,15 @@ def ask_command(
         print(json.dumps(answer.to_dict(), allow_nan=False))
         return 0
     if answer.found:
-        extra = {"at": ["distance (m)"], "box": ["share in box"]}.get(answer.question.form, [])
-        uncertain = any(one.covariance_m2 for one in answer.found)
-        spread = ["sd (m)"] if uncertain else []
-        table = new_table(
-            "name", "x (m)", "y (m)", *spread, *extra, "kind", "words", title=question
+        extra = {"at": [f"distance ({asked.unit})"], "box": ["share in box"]}.get(
+            answer.question.form, []
         )
+        uncertain = any(one.covariance_m2 for one in answer.found)
+        spread = [f"sd ({asked.unit})"] if uncertain else []
+        table = new_table(
+            "name", f"x ({asked.unit})", f"y ({asked.unit})", *spread, *extra, "kind", "words",
+            title=question,
+        )  # fmt: skip
         for one in answer.found:
             number = one.share if answer.question.form == "box" else one.distance_m
             x, y = one.position_m
@@ -235,9 +238,17 @@ def report_command(
     pictures: Annotated[
         float, typer.Option(help="Size limit of the images of frames, in MB; 0: no images.")
     ] = 12.0,
+    source: Annotated[
+        bool,
+        typer.Option(
+            "--source",
+            help="Open the recordings and maps that the folder names, for pictures of frames; not "
+            "for a folder from somebody else.",
+        ),
+    ] = False,
 ) -> int:
     """Write one HTML page that explains a run, for any browser."""
     from neuroslam.report import write_report
 
-    say(f"Written: {write_report(out, to, pictures_mb=pictures)}")
+    say(f"Written: {write_report(out, to, pictures_mb=pictures, source=source)}")
     return 0

@@ -13,7 +13,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain
 from neuroslam.config.files import toml_text
-from neuroslam.errors import RunError, counted
+from neuroslam.errors import RunError, counted, printable
 from neuroslam.limits import MOST_JSON_BYTES, parse_json, read_bounded
 from neuroslam.mapping.tables import Links
 from neuroslam.state.files import write_atomically
@@ -59,7 +59,7 @@ class RunPlan:
     @property
     def name(self) -> str:
         """Short name of the source: the last two parts of its path."""
-        return "/".join(Path(self.source).parts[-2:])
+        return printable("/".join(Path(self.source).parts[-2:]))
 
     @property
     def skips(self) -> bool:

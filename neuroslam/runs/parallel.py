@@ -19,7 +19,10 @@ from typing import Any, TypeVar
 
 from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
+from neuroslam.limits import MAX_MEMORY
 from neuroslam.threads import limit_threads
+
+_HERE = "127.0.0.1"  # no other machine reaches a Ray that is started here
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -192,12 +195,12 @@ def _on_ray(
     running: dict[Any, int] = {}
     try:
         task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt_on_ray)
-        plugins = os.environ.get(PLUGINS, "")
+        settings = {name: os.environ.get(name, "") for name in (PLUGINS, MAX_MEMORY)}
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
                 number, item = waiting.popleft()
-                running[task.remote(plugins, pickle.dumps((function, item)))] = number
+                running[task.remote(settings, pickle.dumps((function, item)))] = number
             (done,), _ = ray.wait(list(running), num_returns=1)
             number = running.pop(done)
             try:
@@ -212,15 +215,15 @@ def _on_ray(
             ray.shutdown()
 
 
-def _attempt_on_ray(plugins: str, call: bytes) -> object:
+def _attempt_on_ray(settings: dict[str, str], call: bytes) -> object:
     """Attempt a call in a worker, which gets no environment of this process.
 
     Args:
-        plugins: Value of :data:`~neuroslam.config.populations.PLUGINS`.
+        settings: Environment variables with the plugins and the budget of memory.
         call: Function and item, pickled: an item can hold a config, whose populations have to be
             known when it is unpickled.
     """
-    os.environ[PLUGINS] = plugins
+    os.environ |= settings
     try:
         known_kinds()  # loads the plugins: the item can hold a class of one
         function, item = pickle.loads(call)
@@ -234,7 +237,9 @@ def _connect(ray: ModuleType, address: str, jobs: int | None) -> None:
     try:
         if address == "local":
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
-            ray.init("local", num_cpus=jobs, include_dashboard=False, **quiet)
+            ray.init(
+                "local", num_cpus=jobs, include_dashboard=False, _node_ip_address=_HERE, **quiet
+            )
         else:
             ray.init(address, **quiet)
     except (ConnectionError, ValueError, RuntimeError) as error:

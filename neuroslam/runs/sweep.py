@@ -13,7 +13,7 @@ from typing import Any
 
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import section_class
-from neuroslam.errors import ConfigError, NeuroslamError, RunError
+from neuroslam.errors import ConfigError, NeuroslamError, RunError, csv_text
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.limits import parse_toml
@@ -345,7 +345,7 @@ def _write(out: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:
     table = csv.DictWriter(text, [*columns, "error"], lineterminator="\n")
     table.writeheader()
     for row in rows:
-        table.writerow({key: _written(value) for key, value in row.items()})
+        table.writerow({key: csv_text(_written(value)) for key, value in row.items()})
     summary = {"varied": keys, "runs": rows}
     try:
         write_text(out / "sweep.csv", text.getvalue())

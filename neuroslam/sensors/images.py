@@ -232,7 +232,7 @@ def decode(data: bytes) -> np.ndarray | None:
         BadFrame: If it has more pixels than memory allows.
     """
     size = image_size(data)
-    if size is None or not _is_complete(data):
+    if size is None or not is_complete(data):
         return None
     check_pixels(*size)
     with quiet_opencv():
@@ -258,7 +258,7 @@ def check_pixels(height: int, width: int) -> None:
         raise BadFrame(f"is {width:,} x {height:,} px, which {too_much(needed)}")
 
 
-def _is_complete(data: bytes) -> bool:
+def is_complete(data: bytes) -> bool:
     """Return False for a truncated JPEG or a damaged PNG, which decoders accept with a warning."""
     if data.startswith(b"\xff\xd8"):  # the end marker comes after the last start of a scan
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")

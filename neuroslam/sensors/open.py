@@ -188,6 +188,18 @@ def absolute_spec(spec: str) -> str:
     return str(Path(spec).resolve())
 
 
+def is_rendered(spec: str) -> bool:
+    """Return whether a source is computed, so that opening it opens no file and no device.
+
+    Example:
+        >>> is_rendered("world:town?laps=2"), is_rendered("arena:rat.npz"), is_rendered("a.avi")
+        (True, False, False)
+    """
+    if not spec.startswith(("world:", "arena:")) or "+" in spec:
+        return False
+    return not spec.partition("?")[0].lower().endswith(".npz")
+
+
 def seeded_spec(spec: str, seed: int) -> str:
     """Return a name for the same source with a seed; the name of a recording stays.
 
