@@ -22,7 +22,9 @@ from neuroslam.errors import NeuroslamError, RunError
 from neuroslam.limits import MAX_MEMORY
 from neuroslam.threads import limit_threads
 
-_HERE = "127.0.0.1"  # no other machine reaches a Ray that is started here
+_RAY_CLUSTER = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Environment variable that, as ``0``, lets a Ray that is started here listen on the loopback
+address only, on any system; Ray reads it when it is imported."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -182,6 +184,8 @@ def _died() -> RunError:
 def _on_ray(
     function: Callable[[T], R], numbered: Mapping[int, T], jobs: int | None, address: str
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
+    if address == "local":
+        os.environ.setdefault(_RAY_CLUSTER, "0")  # no other machine reaches it
     try:
         import ray
         from ray.exceptions import OutOfMemoryError, WorkerCrashedError
@@ -237,9 +241,7 @@ def _connect(ray: ModuleType, address: str, jobs: int | None) -> None:
     try:
         if address == "local":
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
-            ray.init(
-                "local", num_cpus=jobs, include_dashboard=False, _node_ip_address=_HERE, **quiet
-            )
+            ray.init("local", num_cpus=jobs, include_dashboard=False, **quiet)
         else:
             ray.init(address, **quiet)
     except (ConnectionError, ValueError, RuntimeError) as error:

@@ -142,9 +142,9 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
     lines = [line.split(",") for line in read_text(camera / "data.csv").splitlines()]
     lines = [line for line in lines if line[0].strip() and not line[0].startswith("#")]
     try:
-        times = np.array([int(line[0]) for line in lines]) / 1e9
+        times = np.array([int(line[0]) for line in lines], dtype=np.int64) / 1e9
         names = [line[1].strip() for line in lines]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise SourceError(
             f"{camera / 'data.csv'}: is damaged; expected lines 'time in ns,image file'"
         ) from None

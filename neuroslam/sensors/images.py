@@ -232,9 +232,11 @@ def decode(data: bytes) -> np.ndarray | None:
         BadFrame: If it has more pixels than memory allows.
     """
     size = image_size(data)
-    if size is None or not is_complete(data):
+    if size is None:
         return None
     check_pixels(*size)
+    if not is_complete(data):
+        return None
     with quiet_opencv():
         for flags in (cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, cv2.IMREAD_UNCHANGED):
             try:
