@@ -13,6 +13,8 @@ from contextlib import AbstractContextManager, ExitStack
 import cv2
 import torch
 
+_PROCESSORS = os.cpu_count() or 1
+
 
 class limit_threads:  # noqa: N801 - used like a function
     """Limit torch and OpenCV to ``n`` threads within a ``with`` statement.
@@ -42,6 +44,16 @@ class limit_threads:  # noqa: N801 - used like a function
             torch.set_num_threads(torch_threads)
         if cv2.getNumThreads() != cv_threads:
             cv2.setNumThreads(cv_threads)
+
+
+def usable_threads(n: int) -> int:
+    """Return the threads that a config asks for, at most as many as there are processors.
+
+    Example:
+        >>> usable_threads(1)
+        1
+    """
+    return min(n, _PROCESSORS)
 
 
 def without_autocast() -> AbstractContextManager[object]:

@@ -3,7 +3,8 @@
 import csv
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from neuroslam.errors import SourceError
@@ -187,6 +188,18 @@ def absolute_spec(spec: str) -> str:
     return str(Path(spec).resolve())
 
 
+def is_rendered(spec: str) -> bool:
+    """Return whether a source is computed, so that opening it opens no file and no device.
+
+    Example:
+        >>> is_rendered("world:town?laps=2"), is_rendered("arena:rat.npz"), is_rendered("a.avi")
+        (True, False, False)
+    """
+    if not spec.startswith(("world:", "arena:")) or "+" in spec:
+        return False
+    return not spec.partition("?")[0].lower().endswith(".npz")
+
+
 def seeded_spec(spec: str, seed: int) -> str:
     """Return a name for the same source with a seed; the name of a recording stays.
 
@@ -253,10 +266,16 @@ def _open_folder(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
 def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     """Open a text file: an image list if one of its first lines names an image, else motion."""
     text = read_text(path)
-    for row in csv.reader(text.splitlines()[:10]):
+    for row in _first_rows(text, 10):
         if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz, grey)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
+
+
+def _first_rows(text: str, n: int) -> Iterator[list[str]]:
+    """Yield the first rows of a table, as far as they can be read."""
+    with suppress(csv.Error):  # its reader says what is wrong
+        yield from csv.reader(text[:100_000].splitlines()[:n])
 
 
 def _open_positions(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
