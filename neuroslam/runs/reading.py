@@ -1,5 +1,6 @@
 """Readers for the files of a run: rows, plan, figures, and the pose of every frame."""
 
+import json
 import math
 from itertools import islice, takewhile
 from pathlib import Path
