@@ -54,7 +54,7 @@ def write_manifest(staged: Path, rows: Mapping[str, Extent]) -> None:
             files[path.name] = extent_of(path)._asdict()
     content = {"format": _FORMAT, "files": files}
     text = json.dumps(content | {"sha256": _digest(content)}, indent=2, sort_keys=True)
-    write_atomically(staged / MANIFEST, lambda path: path.write_text(text + "\n", encoding="utf-8"))
+    write_atomically(staged / MANIFEST, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def read_manifest(out: Path) -> dict[str, dict[str, Any]] | None:
