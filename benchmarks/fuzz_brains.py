@@ -1,16 +1,14 @@
 """Brains that were crafted: every tensor and every parameter changed in turn, the digest valid."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
 
 from neuroslam.cli import main
-from neuroslam.state.files import tensors_digest
+from neuroslam.state.files import save_checked
 
 CRAFTED = 216
 """Crafted brains of a campaign."""
@@ -52,10 +50,20 @@ def commands_of(out: Path) -> list[tuple[str, ...]]:
         ("export", "@", "@/map.g2o"),
         ("report", "@", "--pictures", "0"),
         ("merge", other, "@", "-o", "@/merged", "--overwrite"),
-        ("run", SOURCE, "-o", "@/joined", "--map", "@/brain.safetensors", "--stop", "3",
-         "--no-tensorboard", "--overwrite"),
+        (
+            "run",
+            SOURCE,
+            "-o",
+            "@/joined",
+            "--map",
+            "@/brain.safetensors",
+            "--stop",
+            "3",
+            "--no-tensorboard",
+            "--overwrite",
+        ),
         ("resume", "@", "--stop", str(LATER), "--no-tensorboard"),
-    ]  # fmt: skip
+    ]
 
 
 def crafted(folder: Path, number: int) -> str:
@@ -81,22 +89,10 @@ def crafted(folder: Path, number: int) -> str:
         how = str(draw.choice(list(_CHANGES)))
         tensors[name] = _CHANGES[how](tensors[name].clone(), draw).contiguous()
         what = f"{name}: {how}"
-    resealed(file, about, tensors)
-    return what
-
-
-def resealed(file: Path, about: dict[str, object], tensors: dict[str, torch.Tensor]) -> None:
-    """Write a brain with a valid digest, and let the folder's manifest know it if there is one."""
-    from neuroslam.state import files
-
-    temporary = file.with_suffix(".new")
     rest = {key: value for key, value in about.items() if key != "sha256"}
-    if hasattr(files, "sealed"):
-        files.save_checked(temporary, rest, tensors)
-    else:
-        text = json.dumps(rest | {"sha256": tensors_digest(tensors)}, sort_keys=True)
-        save_file(tensors, temporary, metadata={_KEY: text})
-    shutil.move(temporary, file)
+    save_checked(file, rest, tensors)  # a valid digest
+    (folder / "manifest.json").unlink(missing_ok=True)  # else it differs from what was saved
+    return what
 
 
 def _number(t: torch.Tensor, value: float, draw: np.random.Generator) -> torch.Tensor:
