@@ -37,11 +37,12 @@ MEGABYTES = 1024
 """Limit of memory for an input, beyond what the program itself takes."""
 READ, REFUSED, FAULTS = "read", "refused", ("traceback", "hang", "crash", "memory")
 _READ, _REFUSED, _TRACEBACK = 0, 2, 1
+_BASE_MB = [0]
 
 
 def outcome(read: Callable[[], object], log: Path) -> tuple[str, float, int]:
     """Read an input in a forked process; return what became of it, seconds and megabytes."""
-    began, before = time.monotonic(), resident_mb()
+    began = time.monotonic()
     child = os.fork()
     if child == 0:
         _in_child(read, log)
@@ -55,7 +56,7 @@ def outcome(read: Callable[[], object], log: Path) -> tuple[str, float, int]:
         os.kill(child, signal.SIGKILL)
         _, status, used = os.wait4(child, 0)
         return "hang", SECONDS, 0
-    seconds, mb = time.monotonic() - began, max(0, used.ru_maxrss // 1024 - before)
+    seconds, mb = time.monotonic() - began, max(0, used.ru_maxrss // 1024 - _BASE_MB[0])
     if os.WIFSIGNALED(status):
         return "crash", seconds, mb
     code = os.WEXITSTATUS(status)
@@ -91,9 +92,12 @@ def _in_child(read: Callable[[], object], log: Path) -> None:
         os._exit(code)
 
 
-def resident_mb() -> int:
-    """Return the memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 // 2**20
+def note_base() -> None:
+    """Note the memory of a process that reads nothing."""
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    _BASE_MB[0] = os.wait4(child, 0)[2].ru_maxrss // 1024
 
 
 def damaged_inputs(folder: Path, keep: Path | None, n: int, only: str) -> dict[str, Counter[str]]:
@@ -132,6 +136,7 @@ def laid(folder: Path, kind: Target, changed: dict[str, bytes]) -> Path:
 def run_folder(folder: Path) -> list[Target]:
     """Return the files of a run as inputs of the commands that read a run."""
     out = sound_run(folder / "run")
+    note_base()
     files = {str(f.relative_to(out)): f.read_bytes() for f in out.rglob("*") if f.is_file()}
     files.pop("manifest.json", None)  # whoever alters a folder can remove its digests
     texts = (
@@ -146,17 +151,34 @@ def run_folder(folder: Path) -> list[Target]:
     return [
         Target("run: texts, verify", files, texts, command("verify", "@"), True),
         Target("run: texts, report", files, texts, command("report", "@", "--pictures", "0"), True),
-        Target("run: texts, resume", files, texts, command("resume", "@", "--stop", "24", "--no-tensorboard"), True),
-        Target("run: trace and events", files, ("trace.f64", events), command("report", "@", "--pictures", "0")),
+        Target(
+            "run: texts, resume",
+            files,
+            texts,
+            command("resume", "@", "--stop", "24", "--no-tensorboard"),
+            True,
+        ),
+        Target(
+            "run: trace and events",
+            files,
+            ("trace.f64", events),
+            command("report", "@", "--pictures", "0"),
+        ),
         Target("run: brain, inspect", files, ("brain.safetensors",), command("inspect", "@")),
-        Target("run: brain, verify", files, ("brain.safetensors",), command("verify", "@/brain.safetensors")),
-    ]  # fmt: skip
+        Target(
+            "run: brain, verify",
+            files,
+            ("brain.safetensors",),
+            command("verify", "@/brain.safetensors"),
+        ),
+    ]
 
 
 def crafted_brains(folder: Path, keep: Path | None, n: int) -> Counter[str]:
     """Craft brains with a valid digest; what ``verify`` calls sound must do in every command."""
     table: Counter[str] = Counter()
     out = sound_run(folder / "whole")
+    note_base()
     for number in range(n):
         at = folder / "crafted"
         shutil.rmtree(at, ignore_errors=True)
@@ -180,12 +202,19 @@ def crafted_brains(folder: Path, keep: Path | None, n: int) -> Counter[str]:
                 (folder / "log").write_text(f"{' '.join(words)} took what verify refuses\n")
         what = worst or ("sound in every command" if sound else REFUSED)
         noted(table, what, seconds, mb, at, keep, f"crafted-{number}-{name}", folder / "log")
-    return table  # fmt: skip
+    return table
 
 
 def noted(
-    row: Counter[str], found: str, seconds: float, mb: int, at: Path, keep: Path | None, name: str, log: Path
-) -> None:  # fmt: skip
+    row: Counter[str],
+    found: str,
+    seconds: float,
+    mb: int,
+    at: Path,
+    keep: Path | None,
+    name: str,
+    log: Path,
+) -> None:
     """Count an outcome; print and keep a fault."""
     row[found] += 1
     row["slowest ms"] = max(row["slowest ms"], round(1000 * seconds))
@@ -215,7 +244,7 @@ def written(table: dict[str, Counter[str]]) -> str:
             total[key] = (
                 max(total[key], value) if key in ("slowest ms", "most MB") else total[key] + value
             )
-    return "\n".join([*lines, _row("all", total, faults)])  # fmt: skip
+    return "\n".join([*lines, _row("all", total, faults)])
 
 
 def _row(name: str, row: Counter[str], faults: tuple[str, ...]) -> str:

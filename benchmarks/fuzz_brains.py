@@ -50,10 +50,20 @@ def commands_of(out: Path) -> list[tuple[str, ...]]:
         ("export", "@", "@/map.g2o"),
         ("report", "@", "--pictures", "0"),
         ("merge", other, "@", "-o", "@/merged", "--overwrite"),
-        ("run", SOURCE, "-o", "@/joined", "--map", "@/brain.safetensors", "--stop", "3",
-         "--no-tensorboard", "--overwrite"),
+        (
+            "run",
+            SOURCE,
+            "-o",
+            "@/joined",
+            "--map",
+            "@/brain.safetensors",
+            "--stop",
+            "3",
+            "--no-tensorboard",
+            "--overwrite",
+        ),
         ("resume", "@", "--stop", str(LATER), "--no-tensorboard"),
-    ]  # fmt: skip
+    ]
 
 
 def crafted(folder: Path, number: int) -> str:

@@ -20,11 +20,48 @@ from neuroslam.sensors.landmarks import read_landmarks
 
 N = 12  # frames of each input
 TOKENS = (
-    *(b"nan", b"inf", b"-inf", b"1e308", b"-1", b"0", b"", b"9" * 400, b"9" * 5000, b"0x" + b"f" * 99),
-    *(b"\0", b"\r", b"\r\n\r", b'"', b"," * 50, b"\xff\xfe", b"\x1b]0;x\x07", b"=1+1", b"\n\n", b"#"),
-    *(b"[" * 3000, b"{" * 3000, b'{"a":' * 3000, b"a." * 3000 + b"a=1", b"x" * 200_000, b"\xc3\x28"),
-    *(b"true", b"null", b"'", b"../../../etc/passwd", b"/dev/zero", b"2147483648", b"-9223372036854775809"),
-)  # fmt: skip
+    *(
+        b"nan",
+        b"inf",
+        b"-inf",
+        b"1e308",
+        b"-1",
+        b"0",
+        b"",
+        b"9" * 400,
+        b"9" * 5000,
+        b"0x" + b"f" * 99,
+    ),
+    *(
+        b"\0",
+        b"\r",
+        b"\r\n\r",
+        b'"',
+        b"," * 50,
+        b"\xff\xfe",
+        b"\x1b]0;x\x07",
+        b"=1+1",
+        b"\n\n",
+        b"#",
+    ),
+    *(
+        b"[" * 3000,
+        b"{" * 3000,
+        b'{"a":' * 3000,
+        b"a." * 3000 + b"a=1",
+        b"x" * 200_000,
+        b"\xc3\x28",
+    ),
+    *(
+        b"true",
+        b"null",
+        b"'",
+        b"../../../etc/passwd",
+        b"/dev/zero",
+        b"2147483648",
+        b"-9223372036854775809",
+    ),
+)
 """Texts that go into texts."""
 WORDS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x10000)
 """Numbers that go into bytes, of one, two, four or eight."""
@@ -87,33 +124,125 @@ def targets(folder: Path) -> list[Target]:
     euroc = rows("#t,f", [(10**8 * k, name) for k, name in enumerate(jpegs)])
     truth = rows("#t,x,y,z,w,x,y,z", [(10**8 * k, 0.1 * k, 0, 0, 1, 0, 0, 0) for k in range(N)])
     kitti = rows("", [(1, 0, 0, 0.1 * k, 0, 1, 0, 0, 0, 0, 1, 0.2 * k) for k in range(N)], " ")
-    ini = b"[visual_odometry]\ncamera_fov_deg = 53\nvtrans_image_x_min = 10\ncamera_hz=10\n[ratslam]\npc_dim_xy=11\nvt_shift_match = 4\n"
-    words = b"kind,number,name,words,corners\nlandmark,1,DOOR,BLUE * TALL,\nlandmark,2,CHAIR,RED,\nwall,,SIDE,GREY,1 2\n"
-    words_toml = b'[[landmark]]\nname = "DOOR"\nnumber = 1\nwords = "BLUE * (TALL + WIDE)"\n[[wall]]\nname = "SIDE"\ncorners = [1, 1]\n'
-    found = [
+    ini = b"[visual_odometry]\ncamera_fov_deg = 53\nvtrans_image_x_min = 10\ncamera_hz=10\n"
+    ini += b"[ratslam]\npc_dim_xy=11\nvt_shift_match = 4\n"
+    words = b"kind,number,name,words,corners\n"
+    words += b"landmark,1,DOOR,BLUE * TALL,\nlandmark,2,CHAIR,RED,\nwall,,SIDE,GREY,1 2\n"
+    words_toml = b'[[landmark]]\nname = "DOOR"\nnumber = 1\nwords = "BLUE * (TALL + WIDE)"\n'
+    words_toml += b'[[wall]]\nname = "SIDE"\ncorners = [1, 1]\n'
+    return [
         Target("motion CSV", {"m.csv": motion}, ("m.csv",), frames_of("m.csv"), True),
         Target("image list", {"l.txt": listed, **jpegs}, ("l.txt",), frames_of("l.txt"), True),
-        Target("folder: times, motion", {"times.txt": times, "odometry.csv": motion, **jpegs}, ("times.txt", "odometry.csv"), frames_of(""), True),
-        Target("TUM folder", {"rgb.txt": listed, "groundtruth.txt": tum, **jpegs}, ("rgb.txt", "groundtruth.txt"), frames_of(""), True),
-        Target("KITTI folder", {"times.txt": times, "poses.txt": kitti, **{f"image_0/{n}": d for n, d in jpegs.items()}}, ("times.txt", "poses.txt"), frames_of(""), True),
-        Target("EuRoC folder", {"mav0/cam0/data.csv": euroc, "mav0/state_groundtruth_estimate0/data.csv": truth, **{f"mav0/cam0/data/{n}": d for n, d in jpegs.items()}}, ("mav0/cam0/data.csv", "mav0/state_groundtruth_estimate0/data.csv"), frames_of(""), True),
-        Target("donkeycar tub", tub(jpegs), ("manifest.json", "catalog_0.catalog"), frames_of(""), True),
-        Target("truth TUM", {"t.tum": tum}, ("t.tum",), lambda f: (read_tum(f / "t.tum"), read_truth(f / "t.tum")), True),
+        Target(
+            "folder: times, motion",
+            {"times.txt": times, "odometry.csv": motion, **jpegs},
+            ("times.txt", "odometry.csv"),
+            frames_of(""),
+            True,
+        ),
+        Target(
+            "TUM folder",
+            {"rgb.txt": listed, "groundtruth.txt": tum, **jpegs},
+            ("rgb.txt", "groundtruth.txt"),
+            frames_of(""),
+            True,
+        ),
+        Target(
+            "KITTI folder",
+            {
+                "times.txt": times,
+                "poses.txt": kitti,
+                **{f"image_0/{n}": d for n, d in jpegs.items()},
+            },
+            ("times.txt", "poses.txt"),
+            frames_of(""),
+            True,
+        ),
+        Target(
+            "EuRoC folder",
+            {
+                "mav0/cam0/data.csv": euroc,
+                "mav0/state_groundtruth_estimate0/data.csv": truth,
+                **{f"mav0/cam0/data/{n}": d for n, d in jpegs.items()},
+            },
+            ("mav0/cam0/data.csv", "mav0/state_groundtruth_estimate0/data.csv"),
+            frames_of(""),
+            True,
+        ),
+        Target(
+            "donkeycar tub", tub(jpegs), ("manifest.json", "catalog_0.catalog"), frames_of(""), True
+        ),
+        Target(
+            "truth TUM",
+            {"t.tum": tum},
+            ("t.tum",),
+            lambda f: (read_tum(f / "t.tum"), read_truth(f / "t.tum")),
+            True,
+        ),
         Target("truth CSV", {"t.csv": motion}, ("t.csv",), lambda f: read_truth(f / "t.csv"), True),
-        Target("landmarks CSV", {"w.csv": words}, ("w.csv",), lambda f: read_landmarks(f / "w.csv"), True),
-        Target("landmarks TOML", {"w.toml": words_toml}, ("w.toml",), lambda f: read_landmarks(f / "w.toml"), True),
-        Target("config TOML", {"c.toml": config}, ("c.toml",), command("run", "@/none.avi", "-o", "@/out", "--config", "@/c.toml"), True),
-        Target("config ini", {"c.ini": ini}, ("c.ini",), command("run", "@/none.avi", "-o", "@/out", "--config", "@/c.ini"), True),
+        Target(
+            "landmarks CSV",
+            {"w.csv": words},
+            ("w.csv",),
+            lambda f: read_landmarks(f / "w.csv"),
+            True,
+        ),
+        Target(
+            "landmarks TOML",
+            {"w.toml": words_toml},
+            ("w.toml",),
+            lambda f: read_landmarks(f / "w.toml"),
+            True,
+        ),
+        Target(
+            "config TOML",
+            {"c.toml": config},
+            ("c.toml",),
+            command("run", "@/none.avi", "-o", "@/out", "--config", "@/c.toml"),
+            True,
+        ),
+        Target(
+            "config ini",
+            {"c.ini": ini},
+            ("c.ini",),
+            command("run", "@/none.avi", "-o", "@/out", "--config", "@/c.ini"),
+            True,
+        ),
         Target("npy", {"a.npy": saved(np.save)}, ("a.npy",), frames_of("a.npy")),
-        Target("npz", {"a.npz": saved(lambda f, p: np.savez(f, pos=p, t=0.1 * np.arange(N)))}, ("a.npz",), frames_of("a.npz")),
-        Target("npz compressed", {"a.npz": saved(lambda f, p: np.savez_compressed(f, pos=p, t=0.1 * np.arange(N)))}, ("a.npz",), frames_of("a.npz")),
+        Target(
+            "npz",
+            {"a.npz": saved(lambda f, p: np.savez(f, pos=p, t=0.1 * np.arange(N)))},
+            ("a.npz",),
+            frames_of("a.npz"),
+        ),
+        Target(
+            "npz compressed",
+            {"a.npz": saved(lambda f, p: np.savez_compressed(f, pos=p, t=0.1 * np.arange(N)))},
+            ("a.npz",),
+            frames_of("a.npz"),
+        ),
         Target("tar", {"a.tar": tarred(jpegs)}, ("a.tar",), frames_of("a.tar")),
-        Target("tar.gz", {"a.tar.gz": gzip.compress(tarred(jpegs))}, ("a.tar.gz",), frames_of("a.tar.gz")),
-        *(Target(f"image {suffix[1:]}", {f"{k}{suffix}": encoded(suffix, k) for k in range(3)}, (f"0{suffix}", f"1{suffix}"), frames_of("")) for suffix in (".jpg", ".png", ".bmp", ".tif", ".webp", ".pgm")),
-        *(Target(f"video {name[2:]}", {name: video(folder / name)}, (name,), frames_of(name)) for name in ("v.avi", "v.mp4", "v.mkv")),
+        Target(
+            "tar.gz",
+            {"a.tar.gz": gzip.compress(tarred(jpegs))},
+            ("a.tar.gz",),
+            frames_of("a.tar.gz"),
+        ),
+        *(
+            Target(
+                f"image {suffix[1:]}",
+                {f"{k}{suffix}": encoded(suffix, k) for k in range(3)},
+                (f"0{suffix}", f"1{suffix}"),
+                frames_of(""),
+            )
+            for suffix in (".jpg", ".png", ".bmp", ".tif", ".webp", ".pgm")
+        ),
+        *(
+            Target(f"video {name[2:]}", {name: video(folder / name)}, (name,), frames_of(name))
+            for name in ("v.avi", "v.mp4", "v.mkv")
+        ),
         *bags(folder),
-    ]  # fmt: skip
-    return found
+    ]
 
 
 def rows(header: str, values: list[tuple[object, ...]], separator: str = ",") -> bytes:
@@ -205,7 +334,7 @@ def bags(folder: Path) -> list[Target]:
                     writer.write(topics[topic], (1 + k) * 10**9, serialize(message, kinds[topic]))
         file = path if first else next(path.glob(f"*{name[1:]}"))
         found.append(Target(f"bag {name[2:]}", {name: file.read_bytes()}, (name,), frames_of(name)))
-    return found  # fmt: skip
+    return found
 
 
 def damage(data: bytes, is_text: bool, draw: np.random.Generator) -> bytes:
@@ -213,12 +342,22 @@ def damage(data: bytes, is_text: bool, draw: np.random.Generator) -> bytes:
     changed = bytearray(data)
     for _ in range(int(draw.integers(1, 5))):
         at = int(draw.integers(0, max(len(changed), 1)))
-        kinds = ("token", "token", "line", "cut", "flip", "twice") if is_text else (
-            "flip", "flip", "word", "word", "cut", "drop", "twice", "zeros", "head")  # fmt: skip
+        kinds = (
+            ("token", "token", "line", "cut", "flip", "twice")
+            if is_text
+            else ("flip", "flip", "word", "word", "cut", "drop", "twice", "zeros", "head")
+        )
         size = int(2 ** draw.uniform(0, 10))
         match str(draw.choice(kinds)):
             case "token":
-                start = max(changed.rfind(b" ", 0, at), changed.rfind(b",", 0, at), changed.rfind(b"\n", 0, at)) + 1  # fmt: skip
+                start = (
+                    max(
+                        changed.rfind(b" ", 0, at),
+                        changed.rfind(b",", 0, at),
+                        changed.rfind(b"\n", 0, at),
+                    )
+                    + 1
+                )
                 ends = [e for e in (changed.find(s, start) for s in (b",", b" ", b"\n")) if e >= 0]
                 changed[start : min(ends, default=len(changed))] = TOKENS[
                     draw.integers(len(TOKENS))

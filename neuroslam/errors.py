@@ -136,6 +136,10 @@ def with_new_names(
 class NeuroslamError(Exception):
     """Base of all errors that neuroslam raises on purpose; the command line prints one line."""
 
+    def __str__(self) -> str:
+        """Return the message as one line, whatever the names in it hold."""
+        return printable(super().__str__())
+
 
 class ConfigError(NeuroslamError, ValueError):
     """An unusable configuration: unknown key, value out of bounds, unreadable file."""

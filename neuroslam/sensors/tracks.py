@@ -302,7 +302,7 @@ def parse_table(
             if on_bad_row is None:
                 raise
             on_bad_row(str(fault))
-    array = np.array(values, dtype=np.float64).reshape(len(values), -1)
+    array = np.array(values, dtype=np.float64).reshape(len(values), len(values[0]) if values else 0)
     table = dict(zip(wanted, array.T, strict=False)) if len(values) else {
         field: np.zeros(0) for field in wanted
     }  # fmt: skip
