@@ -17,7 +17,7 @@ from neuroslam.config.files import toml_text
 from neuroslam.errors import RunError, counted, printable
 from neuroslam.limits import MOST_JSON_BYTES, parse_json, read_bounded
 from neuroslam.mapping.tables import Links
-from neuroslam.runs.manifest import MANIFEST, Extent, check_saved
+from neuroslam.runs.manifest import MANIFEST, ROWS, Extent, check_saved
 from neuroslam.runs.saves import settle
 from neuroslam.state.files import write_atomically
 from neuroslam.types import Frame, StepResult
@@ -37,9 +37,6 @@ RUN_FILES = (
     "frames.csv", "trace.f64", "config.toml", "metrics.json", "brain.safetensors",
     "experiences.csv", "links.csv", "trajectory.tum", "map.png",
 )  # fmt: skip
-ROWS = RUN_FILES[:2]
-"""The files with one row per frame."""
-
 LANDMARKS_FILE = "landmarks.csv"
 """Written if the brain has a semantic map; other populations can write tables of their own."""
 

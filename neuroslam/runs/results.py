@@ -15,14 +15,13 @@ from neuroslam.errors import MapError
 from neuroslam.evaluation.trajectory import Track, absolute_trajectory_error, write_tum
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import (
-    ROWS,
     RunPlan,
     experiences_csv,
     links_csv,
     run_files,
     write_text,
 )
-from neuroslam.runs.manifest import Extent, extent_of, write_manifest
+from neuroslam.runs.manifest import ROWS, Extent, extent_of, write_manifest
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import (
     odometry_track,

@@ -102,7 +102,7 @@ def settle(out: Path) -> None:
             has been saving for ten seconds.
     """
     late = time.monotonic() + _WAIT_S
-    while os.path.lexists(out / COMMITTED) or os.path.lexists(out / STAGED):
+    while any(os.path.lexists(out / name) for name in (COMMITTED, STAGED, LOCK)):
         try:
             with _locked(out) as held:
                 if held:
@@ -200,7 +200,7 @@ def _removed(path: Path) -> list[str]:
     return [
         name
         for name in names
-        if isinstance(name, str) and Path(name).name == name and not name.startswith(".")
+        if isinstance(name, str) and name and Path(name).name == name and name[0] != "."
     ]
 
 
