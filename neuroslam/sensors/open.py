@@ -29,8 +29,8 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of images, an image list or motion CSV, an .npz or .npy track, "
-    "a TUM, KITTI or EuRoC folder, a donkeycar tub, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
-    "motion as drive.avi+motion.csv"
+    "a TUM, KITTI or EuRoC folder, a donkeycar tub, a ROS bag, camera:0, world:NAME, arena:NAME, "
+    "or a camera and motion as drive.avi+motion.csv"
 )
 _OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
 _PREFIXES = ("world:", "arena:", "camera:")
