@@ -39,7 +39,9 @@ def sweep_command(
     seeds: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Runs of each combination, with seeds 0, 1, ... for noise and weights."
+            min=1,
+            max=10_000,
+            help="Runs of each combination, with seeds 0, 1, ... for noise and weights.",
         ),
     ] = None,
     preset: Preset = None,

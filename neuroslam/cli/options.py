@@ -33,6 +33,7 @@ Confirm = Annotated[
     int | None,
     typer.Option(
         min=1,
+        max=1_000_000,
         help="Experiences that must agree before maps are joined; 1: the first match decides.",
     ),
 ]
@@ -43,7 +44,7 @@ Source = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-        "TUM, KITTI or EuRoC folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
+        "TUM, KITTI, EuRoC or donkeycar folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
         "world:NAME.",
     ),
 ]
@@ -101,7 +102,9 @@ Overwrite = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Runs at a time; default: 1, on a cluster its number of processors."),
+    typer.Option(
+        min=1, max=1024, help="Runs at a time; default: 1, on a cluster its number of processors."
+    ),
 ]
 RayAddress = Annotated[
     str | None,

@@ -122,7 +122,7 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
                 number = math.nan
             if not math.isfinite(number):
                 raise ConfigError(
-                    f"config {path}: {key} = {raw!r} in [{section}]; expected a finite number"
+                    f"config {path}: {key} = {raw!r} in [{section}]; expected a number, finite"
                 )
             if prefix in _CLASSIC_REGIONS:
                 regions.setdefault(prefix, {})[key.removeprefix(prefix + "_")] = int(number)

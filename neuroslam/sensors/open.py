@@ -29,8 +29,8 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of images, an image list or motion CSV, an .npz or .npy track, "
-    "a TUM, KITTI or EuRoC folder, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
-    "motion as drive.avi+motion.csv"
+    "a TUM, KITTI or EuRoC folder, a donkeycar tub, a ROS bag, camera:0, world:NAME, arena:NAME, "
+    "or a camera and motion as drive.avi+motion.csv"
 )
 _OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
 _PREFIXES = ("world:", "arena:", "camera:")
@@ -50,6 +50,7 @@ def open_source(
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
     ``rat.npz`` with an arena in it     positions and walls (:mod:`neuroslam.worlds.rodent`)
     TUM, KITTI or EuRoC folder          images and truth (:mod:`neuroslam.sensors.datasets`)
+    tub of donkeycar                    images, times, controls (:mod:`neuroslam.sensors.tub`)
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
     ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)

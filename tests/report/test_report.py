@@ -18,11 +18,12 @@ import pytest
 
 from neuroslam import BrainConfig, load_brain
 from neuroslam.cli import main
+from neuroslam.merging.report import MergeReport
 from neuroslam.report import collect, write_report
 from neuroslam.report.collect import chosen_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
-from neuroslam.report.rows import config_rows
+from neuroslam.report.rows import config_rows, metric_rows
 from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 
@@ -486,3 +487,21 @@ def test_ctrl_c_while_a_page_is_made_leaves_the_old_one(runs, tmp_path):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 130, done.stderr
     assert (out / "report.html").read_text() == "old"
+
+
+def test_lengths_of_one_camera_alone_are_in_an_arbitrary_unit_everywhere(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for k in range(6):
+        coarse = np.random.default_rng(k).integers(0, 255, (6, 8), np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), cv2.resize(coarse, (64, 48)))
+    run(folder, tmp_path / "out", tensorboard=False)
+    page = Page(write_report(tmp_path / "out"))
+    assert page.about["unit"] == "arbitrary unit"
+    assert not any(unit == "m" for _, _, unit in page.about["metrics"])
+    report = MergeReport(True, "x", rotation_rad=0.0, translation_m=[1.0, 2.0])
+    assert report.lines("arbitrary unit")[-1].endswith("moved by 1.00, 2.00 arbitrary unit")
+    assert report.lines()[-1].endswith("moved by 1.00, 2.00 m")
+    assert metric_rows({"ate_rmse_m": 0.2}, "arbitrary unit") == [
+        ["ate rmse", 0.2, "arbitrary unit"]
+    ]
