@@ -25,9 +25,9 @@ COLUMNS = "| key | default | bounds | meaning | OpenRatSLAM |\n|---|---|---|---|
 
 
 def bounds(metadata: list[object]) -> str:
-    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<=", "max_length": "length <="}
     found = [
-        f"{sign} {getattr(each, name):g}"
+        f"{sign} {getattr(each, name):.16g}"
         for each in metadata
         for name, sign in signs.items()
         if getattr(each, name, None) is not None

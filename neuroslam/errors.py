@@ -39,6 +39,64 @@ def counted(n: int, one: str, several: str = "") -> str:
     return f"{n:,} {one if n == 1 else several or one + 's'}"
 
 
+def printable(text: str) -> str:
+    r"""Escape what a terminal would not print as it is: control characters, and bytes of a name.
+
+    Names of files and of members of archives come from elsewhere: raw, they could move the cursor,
+    set the title of the window, or forge a line.
+
+    Example:
+        >>> printable("a\nb\x1b]0;c\udcff"), printable("день")
+        ('a\\nb\\x1b]0;c\\xff', 'день')
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else _escaped(c) for c in text)
+
+
+def csv_text(text: str) -> str:
+    """Return a cell of a CSV table that no spreadsheet takes for a formula.
+
+    A text that starts with ``=``, ``+``, ``-``, ``@`` or a control character gets an apostrophe in
+    front; a number stays as it is.
+
+    Example:
+        >>> csv_text("=1+1.csv"), csv_text("-0.5"), csv_text("drive.avi")
+        ("'=1+1.csv", '-0.5', 'drive.avi')
+    """
+    text = printable(text)
+    if not text.startswith(("=", "+", "-", "@")):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte that is not UTF-8, as os.fsdecode writes it
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape", "backslashreplace").decode()
+
+
+def require_utf8(name: object, error: "type[NeuroslamError]") -> None:
+    """Refuse a name with bytes that are not UTF-8: libraries below take text only.
+
+    Args:
+        name: Of a file or a source.
+        error: Type of the error to raise.
+
+    Raises:
+        NeuroslamError: Of that type.
+    """
+    try:
+        str(name).encode()
+    except UnicodeEncodeError:
+        raise error(f"{printable(str(name))}: its name is not UTF-8; rename it") from None
+
+
 def first_line(error: BaseException) -> str:
     """Return the line of a long error that says what is wrong."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -77,6 +135,10 @@ def with_new_names(
 
 class NeuroslamError(Exception):
     """Base of all errors that neuroslam raises on purpose; the command line prints one line."""
+
+    def __str__(self) -> str:
+        """Return the message as one line, whatever the names in it hold."""
+        return printable(super().__str__())
 
 
 class ConfigError(NeuroslamError, ValueError):

@@ -8,10 +8,18 @@ thread in every forked child, as torch's own ``DataLoader`` does.
 """
 
 import os
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import cv2
 import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_PROCESSORS = os.cpu_count() or 1
 
 
 class limit_threads:  # noqa: N801 - used like a function
@@ -44,6 +52,16 @@ class limit_threads:  # noqa: N801 - used like a function
             cv2.setNumThreads(cv_threads)
 
 
+def usable_threads(n: int) -> int:
+    """Return the threads that a config asks for, at most as many as there are processors.
+
+    Example:
+        >>> usable_threads(1)
+        1
+    """
+    return min(n, _PROCESSORS)
+
+
 def without_autocast() -> AbstractContextManager[object]:
     """Let torch compute in the types of its tensors, also where a caller uses ``torch.autocast``.
 
@@ -58,6 +76,28 @@ def without_autocast() -> AbstractContextManager[object]:
         if torch.is_autocast_enabled(kind):
             disabled.enter_context(torch.autocast(kind, enabled=False))
     return disabled
+
+
+def in_own_types(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a function compute in the types of its tensors, also under ``torch.autocast``.
+
+    Positions and phases have too few digits in the types of autocast.
+
+    Example:
+        >>> product = in_own_types(torch.matmul)
+        >>> with torch.autocast("cpu", dtype=torch.bfloat16):
+        ...     product(torch.ones(1, 1), torch.ones(1, 1)).dtype
+        torch.float32
+    """
+
+    @wraps(function)
+    def computed(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.is_autocast_enabled() or torch.is_autocast_enabled("cpu"):
+            with without_autocast():
+                return function(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return computed
 
 
 def is_plain(n: int) -> bool:

@@ -19,7 +19,7 @@ from neuroslam.sensors.frames import (
 from neuroslam.state.answers import moves_others
 from neuroslam.state.population import Correction, Decision, Population, StepInput, total
 from neuroslam.state.sessions import Session, session_id
-from neuroslam.threads import is_plain, limit_threads, without_autocast
+from neuroslam.threads import is_plain, limit_threads, usable_threads, without_autocast
 from neuroslam.types import (
     NO_TEMPLATE,
     Frame,
@@ -100,9 +100,10 @@ class NavigationBrain(BrainState):
         """
         if self.half_taken:
             raise RuntimeError(self.half_taken)
-        if is_plain(self.config.threads):
+        threads = usable_threads(self.config.threads)
+        if is_plain(threads):
             return self._take(frame)
-        with limit_threads(self.config.threads), without_autocast():
+        with limit_threads(threads), without_autocast():
             return self._take(frame)
 
     def _take(self, frame: Frame) -> StepResult:

@@ -14,6 +14,7 @@ from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import HOMES
+from neuroslam.config.size import check_size
 from neuroslam.errors import ConfigError, counted
 from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
@@ -32,7 +33,7 @@ from neuroslam.state.population import Population
 from neuroslam.state.registry import leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
 from neuroslam.state.tables import Scalars
-from neuroslam.threads import limit_threads
+from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.types import NO_TEMPLATE, Frame, Pose, ViewMatch
 from neuroslam.view.features import Encoder, view_encoder
 from neuroslam.view.templates import LocalViewCells
@@ -59,6 +60,9 @@ class BrainState(QuickModule):
     Args:
         config: All parameters.
         features: Network that computes views, if ``config.view.features`` is ``"module"``.
+
+    Raises:
+        ConfigError: If the config asks for more memory than there is.
 
     Attributes:
         half_taken: Why the state is not that of any frame: an error interrupted a frame after the
@@ -88,6 +92,7 @@ class BrainState(QuickModule):
     ) -> None:
         super().__init__()
         self.config = config or BrainConfig()
+        check_size(self.config)
         self._encoder = view_encoder(self.config.view, features)
         # Source, preset and date of the next session.
         self.about: tuple[str, str, str] = ("", "", "")
@@ -434,7 +439,7 @@ def _rebuilt(
 ) -> BrainState:
     """Make a brain of what a pickle holds."""
     brain = brain_class.__new__(brain_class)
-    with limit_threads(config.threads):
+    with limit_threads(usable_threads(config.threads)):
         BrainState.__init__(brain, config, features=encoder)
         brain.load_state_dict(as_tensors(state))
     for name, value in more.items():

@@ -19,6 +19,7 @@ from torch import Tensor
 from neuroslam.cells.convolve import ring_convolve
 from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BrainConfig, Section
+from neuroslam.config.bounds import MOST_CELLS, MOST_COUNT
 from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.sensors.frames import checked_number
@@ -39,6 +40,7 @@ class HeadDirectionConfig(Section):
     n: int = Field(
         default=120,
         ge=24,
+        le=MOST_CELLS,
         description="number of cells, preferred directions evenly over the full turn; larger: "
         "slower, not more exact",
     )
@@ -87,6 +89,7 @@ class HeadDirectionConfig(Section):
     inject_after: int = Field(
         default=10,
         ge=0,
+        le=MOST_COUNT,
         description="number of newest views that never correct; larger: the robot must be away "
         "longer before a view corrects the heading",
     )

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neuroslam.compiled import compiled, runs_compiled
 from neuroslam.config import BrainConfig, Section
+from neuroslam.config.bounds import LARGEST_SEED, MOST_NEURONS
 from neuroslam.state.mergeable import Arrays, about_now, without_gradients
 from neuroslam.state.pickling import Calls
 from neuroslam.state.population import Population, StepInput
@@ -30,7 +31,10 @@ class SpeedCellConfig(Section):
     """Speed cells: a population of linear rates, and the read-out of a speed from them."""
 
     n: int = Field(
-        default=32, ge=2, description="number of cells; larger: the read-out averages more noise"
+        default=32,
+        ge=2,
+        le=MOST_NEURONS,
+        description="number of cells; larger: the read-out averages more noise",
     )
     max_speed_m_s: float = Field(
         default=2.0,
@@ -59,7 +63,9 @@ class SpeedCellConfig(Section):
         description="standard deviation of the noise of each rate in each step; larger: noisier "
         "speed",
     )
-    seed: int = Field(default=0, ge=0, description="seed of the tuning and of the noise")
+    seed: int = Field(
+        default=0, ge=0, le=LARGEST_SEED, description="seed of the tuning and of the noise"
+    )
 
     @model_validator(mode="after")
     def _bands_are_bands(self) -> Self:

@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 from neuroslam import compiled
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
 from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
-from neuroslam.cli.options import with_plugins
+from neuroslam.cli.options import with_common_options
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, console, say
 from neuroslam.cli.results import (
     ask_command,
@@ -31,7 +31,7 @@ from neuroslam.cli.results import (
     verify_command,
 )
 from neuroslam.cli.settings import presets_command, tune_command
-from neuroslam.errors import NeuroslamError, RenamedKeyWarning
+from neuroslam.errors import NeuroslamError, RenamedKeyWarning, printable, require_utf8
 from neuroslam.interrupts import raising_interrupts
 
 
@@ -97,7 +97,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
 for _name, _command in _COMMANDS.items():
     # A position such as -1,2 is no option.
     negative = {"ignore_unknown_options": _name == "plan"}
-    app.command(_name, context_settings=negative)(with_plugins(_command))
+    app.command(_name, context_settings=negative)(with_common_options(_command))
 
 
 @contextmanager
@@ -142,6 +142,28 @@ def _warnings_in_one_line(command: str) -> Iterator[None]:
         yield
 
 
+def _out_of_memory(error: BaseException) -> bool:
+    """Return whether torch, OpenCV or Python were refused memory."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or any(
+        sign in text for sign in ("allocate memory", "not enough memory", "insufficient memory")
+    )
+
+
+@contextmanager
+def _replacing_letters() -> Iterator[None]:
+    """Print "?" for letters that the terminal does not have."""
+    before = getattr(sys.stdout, "errors", None)
+    if before != "strict" or not hasattr(sys.stdout, "reconfigure"):
+        yield
+        return
+    sys.stdout.reconfigure(errors="replace")
+    try:
+        yield
+    finally:
+        sys.stdout.reconfigure(errors=before)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; 0 is success, 2 an error that the user can fix, 130 an interruption."""
     arguments: list[Any] = sys.argv[1:] if argv is None else argv
@@ -149,14 +171,32 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if console.is_terminal:
             compiled.announce = lambda: say("compiling, once on this machine: up to half a minute")
-        with _quiet_writers(), _warnings_in_one_line(command), raising_interrupts():
+        for argument in map(str, arguments):
+            require_utf8(argument, NeuroslamError)
+        with (
+            _replacing_letters(),
+            _quiet_writers(),
+            _warnings_in_one_line(command),
+            raising_interrupts(),
+        ):
             return app(args=arguments, prog_name="neuroslam", standalone_mode=False) or 0
     except typer.Abort:
         complain(command, "interrupted")
         return INTERRUPTED
     except typer.TyperException as error:
-        cast(Any, error).show()  # what typer raises can, though its public base class cannot
+        shown = cast(Any, error)  # what typer raises has these, though its public base has not
+        if not str(shown.message).startswith("Usage"):  # help, which has lines
+            shown.message = printable(str(shown.message))
+        shown.show()
         return USER_ERROR
     except NeuroslamError as error:
         complain(command, str(error))
+        return USER_ERROR
+    except RecursionError:
+        complain(command, "a file or a value is nested too deeply; expected a few levels")
+        return USER_ERROR
+    except Exception as error:
+        if not _out_of_memory(error):
+            raise
+        complain(command, "out of memory; free some, or use a smaller source or config")
         return USER_ERROR

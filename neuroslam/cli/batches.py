@@ -1,5 +1,7 @@
 """Commands for many runs: sweep, fleet, experiment."""
 
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -37,7 +39,9 @@ def sweep_command(
     seeds: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Runs of each combination, with seeds 0, 1, ... for noise and weights."
+            min=1,
+            max=10_000,
+            help="Runs of each combination, with seeds 0, 1, ... for noise and weights.",
         ),
     ] = None,
     preset: Preset = None,
@@ -84,13 +88,29 @@ def sweep_command(
                 say(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
             raise
     columns = ["templates", "experiences", "loop_closures", *counted_by_cells(rows), "ate_rmse_m"]
+    if any(0 < row.get("frames_with_truth", 0) < row.get("frames", 0) for row in rows):
+        columns.append("frames_with_truth")
     keys = [*varied(rows), *(key for key in columns if any(row.get(key) for row in rows))]
     say(down([{key: row.get(key, "") for key in keys} for row in rows], "sweep"))
     failed = [row for row in rows if row["error"]]
     for row in failed:
         complain("sweep", f"{row['run']}: {row['error']}")
+    say_notes(out, [row["run"] for row in rows])
     say(f"Written: {out}")
     return USER_ERROR if failed else 0
+
+
+def say_notes(out: Path, folders: Iterable[str]) -> None:
+    """Print once each what the readers of the sources noted in several runs."""
+    from neuroslam.errors import RunError
+    from neuroslam.runs.reading import read_metrics
+
+    printed: dict[str, None] = {}
+    for folder in folders:
+        with suppress(RunError):  # a run that failed
+            printed |= dict.fromkeys(map(str, read_metrics(out / folder).get("notes", ())))
+    for note in printed:
+        say(note)
 
 
 def fleet_command(
@@ -143,6 +163,7 @@ def fleet_command(
         )
     for part in report.apart:
         say(f"stays apart: sessions {', '.join(map(str, part['sessions']))}")
+    say_notes(out, sorted(f"sessions/{path.name}" for path in (out / "sessions").iterdir()))
     say(f"Written: {out}")
     for row in report.failed:
         complain("fleet", f"session {row['session']}: {row['error']}")

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from neuroslam.cli.options import (
     Assignments,
@@ -29,6 +28,7 @@ from neuroslam.cli.options import (
 )
 from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
 from neuroslam.cli.progress import show_frames
+from neuroslam.cli.tables import Table
 from neuroslam.errors import counted
 
 if TYPE_CHECKING:
@@ -130,10 +130,12 @@ def merge_command(
 ) -> int:
     """Merge two finished sessions; exit 3 if the merge is refused: nothing is written then."""
     from neuroslam.runs.merge import merge_runs
+    from neuroslam.runs.reading import length_unit
 
     summary, reports = merge_runs(first, second, out, confirm=confirm, overwrite=overwrite)
+    unit = length_unit(first) if length_unit(first) == length_unit(second) else "m"
     for report in reports:
-        _print_report(report.to_dict())
+        _print_report(report.to_dict(), unit)
     if summary is None:
         return REFUSED
     _print_not_joined(summary)
@@ -160,6 +162,7 @@ def demo_command(out: Out = Path("demo")) -> int:
 
 def _report(summary: "RunSummary", out: Path, command: str) -> int:
     from neuroslam.runs.inspect import shown_count
+    from neuroslam.runs.reading import unit_of
 
     figures = summary.to_dict()
     for note in summary.notes:
@@ -188,10 +191,8 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     counts = [f"{name} {value}" for name, value in starmap(shown_count, summary.cells.items())]
     if counts:
         say(", ".join(counts))
-    for report in summary.merges:
-        _print_report(report)
-    for report in summary.refusals[:3]:
-        _print_report(report)
+    for report in (*summary.merges, *summary.refusals[:3]):
+        _print_report(report, unit_of(summary.measured))
     _print_not_joined(summary)
     if summary.unplaced:
         say(
@@ -242,10 +243,10 @@ def _print_not_joined(summary: "RunSummary") -> None:
         say(f"not joined: {len(summary.not_joined) - 3} more maps, see metrics.json")
 
 
-def _print_report(report: dict[str, Any]) -> None:
+def _print_report(report: dict[str, Any], unit: str) -> None:
     from neuroslam.merging.report import MergeReport
 
-    first, *others = MergeReport(**report).lines()
+    first, *others = MergeReport(**report).lines(unit)
     at = "" if report["at_frame"] is None else f"frame {report['at_frame']}: "
     say(f"{at}{first}")
     for line in others:

@@ -1,13 +1,18 @@
 """Arguments and options that several commands have."""
 
 import inspect
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from neuroslam.errors import ConfigError
+from neuroslam.limits import MAX_MEMORY, budget_bytes
 
 
 class OnBadFrame(StrEnum):
@@ -28,6 +33,7 @@ Confirm = Annotated[
     int | None,
     typer.Option(
         min=1,
+        max=1_000_000,
         help="Experiences that must agree before maps are joined; 1: the first match decides.",
     ),
 ]
@@ -38,7 +44,7 @@ Source = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-        "TUM, KITTI or EuRoC folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
+        "TUM, KITTI, EuRoC or donkeycar folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
         "world:NAME.",
     ),
 ]
@@ -96,7 +102,9 @@ Overwrite = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Runs at a time; default: 1, on a cluster its number of processors."),
+    typer.Option(
+        min=1, max=1024, help="Runs at a time; default: 1, on a cluster its number of processors."
+    ),
 ]
 RayAddress = Annotated[
     str | None,
@@ -115,23 +123,60 @@ Plugins = Annotated[
 ]
 
 
-def with_plugins(command: Callable[..., int]) -> Callable[..., int]:
-    """Add ``--plugin`` to a command; the files are loaded before it runs."""
+MaxMemory = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        help="Memory that files, archives, images and a config may take, as 2G; default: half of "
+        "what is free.",
+    ),
+]
+
+
+def with_common_options(command: Callable[..., int]) -> Callable[..., int]:
+    """Add ``--plugin`` and ``--max-memory`` to a command; they take effect before it runs."""
 
     @wraps(command)
-    def run(*args: object, plugin: list[Path] | None = None, **options: object) -> int:
-        if plugin:
-            from neuroslam.config.populations import load_plugin
+    def run(
+        *args: object,
+        plugin: list[Path] | None = None,
+        max_memory: str | None = None,
+        **options: object,
+    ) -> int:
+        with _budget(max_memory):
+            if plugin:
+                from neuroslam.config.populations import load_plugin
 
-            for file in plugin:
-                load_plugin(file)
-        return command(*args, **options)
+                for file in plugin:
+                    load_plugin(file)
+            return command(*args, **options)
 
+    more = {"plugin": Plugins, "max_memory": MaxMemory}
     signature = inspect.signature(command)
-    last = inspect.Parameter(
-        "plugin", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Plugins
-    )
-    parameters = [*signature.parameters.values(), last]
+    last = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+        for name, kind in more.items()
+    ]
+    parameters = [*signature.parameters.values(), *last]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {**command.__annotations__, "plugin": Plugins}
+    run.__annotations__ = {**command.__annotations__, **more}
     return run
+
+
+@contextmanager
+def _budget(text: str | None) -> Iterator[None]:
+    """Set the budget of this process, and of those that it starts."""
+    before = os.environ.get(MAX_MEMORY)
+    if text is not None:
+        os.environ[MAX_MEMORY] = text
+    try:
+        budget_bytes()
+    except ValueError as error:
+        raise ConfigError(f"--max-memory: {error}") from None
+    else:
+        yield
+    finally:
+        if text is not None:
+            os.environ.pop(MAX_MEMORY)
+        if text is not None and before is not None:
+            os.environ[MAX_MEMORY] = before

@@ -4,6 +4,8 @@ import sys
 
 from rich.console import Console
 
+from neuroslam.errors import printable
+
 console = Console(markup=False, soft_wrap=True)  # keeps paths whole: brackets, long lines
 
 INTERRUPTED = 130
@@ -12,10 +14,10 @@ REFUSED = 3
 
 
 def complain(command: str, text: str) -> None:
-    """Print one line of error to stderr."""
-    print(f"neuroslam {command}: {text}", file=sys.stderr)
+    """Print one line of error to stderr; what is not printable is escaped."""
+    print(printable(f"neuroslam {command}: {text}"), file=sys.stderr)
 
 
 def say(what: object) -> None:
-    """Print a line or a table to stdout."""
-    console.print(what)
+    """Print a line or a table to stdout; what is not printable in a line is escaped."""
+    console.print(printable(what) if isinstance(what, str) else what)

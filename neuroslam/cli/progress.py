@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from neuroslam.cli import output
+from neuroslam.errors import printable
 
 if TYPE_CHECKING:
     from neuroslam.types import StepResult
@@ -21,7 +22,7 @@ def show_stages(name: str) -> Iterator[Callable[[str], None]]:
         *columns, console=output.console, transient=True, disable=not output.console.is_terminal
     ) as bar:
         task = bar.add_task(name, total=None)
-        yield lambda stage: bar.update(task, description=f"{name}: {stage}")
+        yield lambda stage: bar.update(task, description=printable(f"{name}: {stage}"))
 
 
 @contextmanager
@@ -44,7 +45,7 @@ def show_runs(name: str) -> Iterator[Callable[[str, int, int], None]]:
         task = bar.add_task(name, total=1)
 
         def on_done(what: str, done: int, total: int) -> None:
-            bar.update(task, description=f"{name}: {what}", completed=done, total=total)
+            bar.update(task, description=printable(f"{name}: {what}"), completed=done, total=total)
 
         yield on_done
 
@@ -64,7 +65,7 @@ def show_frames(
     )
     import time
 
-    shown = (Path(name).name or name)[:18]  # the line fits 80 columns
+    shown = printable(Path(name).name or name)[:18]  # the line fits 80 columns
     on_screen = output.console.is_terminal
     with Progress(
         *columns,

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.table import Table
 
 from neuroslam.cli.options import Axes, Landmarks, MapFile, RunFolder, Truth
 from neuroslam.cli.output import USER_ERROR, complain, say
-from neuroslam.cli.tables import new_table
-from neuroslam.errors import RunError, counted
+from neuroslam.cli.tables import Table, new_table
+from neuroslam.errors import RunError, counted, printable
 
 if TYPE_CHECKING:
     from neuroslam.evaluation.trajectory import AlignmentMode
@@ -75,12 +74,15 @@ def ask_command(
         print(json.dumps(answer.to_dict(), allow_nan=False))
         return 0
     if answer.found:
-        extra = {"at": ["distance (m)"], "box": ["share in box"]}.get(answer.question.form, [])
-        uncertain = any(one.covariance_m2 for one in answer.found)
-        spread = ["sd (m)"] if uncertain else []
-        table = new_table(
-            "name", "x (m)", "y (m)", *spread, *extra, "kind", "words", title=question
+        extra = {"at": [f"distance ({asked.unit})"], "box": ["share in box"]}.get(
+            answer.question.form, []
         )
+        uncertain = any(one.covariance_m2 for one in answer.found)
+        spread = [f"sd ({asked.unit})"] if uncertain else []
+        table = new_table(
+            "name", f"x ({asked.unit})", f"y ({asked.unit})", *spread, *extra, "kind", "words",
+            title=question,
+        )  # fmt: skip
         for one in answer.found:
             number = one.share if answer.question.form == "box" else one.distance_m
             x, y = one.position_m
@@ -183,7 +185,9 @@ def evaluate_command(
     if against is not None and truth is not None:
         raise RunError("--against: compares two maps, --truth a trajectory; give one of them")
     if against is not None:
-        table = Table(title=f"Experiences of {track} aligned with those of {against} by ICP")
+        table = Table(
+            title=printable(f"Experiences of {track} aligned with those of {against} by ICP")
+        )
         for column in ("alignment", "RMSE (m)", "of the diagonal (%)", "rotation (°)", "scale"):
             table.add_column(column, justify="left" if column == "alignment" else "right")
         rows, figure = compare_maps(track, against, to)
@@ -200,7 +204,7 @@ def evaluate_command(
         return 0
 
     how = f", {align} alignment" if align else ""
-    table = Table(title=f"{track} and ground truth{how}")
+    table = Table(title=printable(f"{track} and ground truth{how}"))
     for column in ("error", "rmse", "mean", "median", "max", "unit", "frames"):
         table.add_column(column, justify="left" if column in ("error", "unit") else "right")
     notes: list[str] = []
@@ -234,9 +238,17 @@ def report_command(
     pictures: Annotated[
         float, typer.Option(help="Size limit of the images of frames, in MB; 0: no images.")
     ] = 12.0,
+    source: Annotated[
+        bool,
+        typer.Option(
+            "--source",
+            help="Open the recordings and maps that the folder names, for pictures of frames; not "
+            "for a folder from somebody else.",
+        ),
+    ] = False,
 ) -> int:
     """Write one HTML page that explains a run, for any browser."""
     from neuroslam.report import write_report
 
-    say(f"Written: {write_report(out, to, pictures_mb=pictures)}")
+    say(f"Written: {write_report(out, to, pictures_mb=pictures, source=source)}")
     return 0

@@ -3,6 +3,7 @@
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails
 
+from neuroslam.config.bounds import MOST_THREADS
 from neuroslam.config.navigation import (
     BoundaryCellConfig,
     GridCellConfig,
@@ -54,7 +55,10 @@ class BrainConfig(Section):
         default=20.0, gt=0, description="frame rate, where the source has no time stamps"
     )
     threads: int = Field(
-        default=1, ge=1, description="CPU threads of a run; for a single brain 1 is the fastest"
+        default=1,
+        ge=1,
+        le=MOST_THREADS,
+        description="CPU threads of a run; for a single brain 1 is the fastest",
     )
     max_gap_s: float = Field(
         default=2.0,

@@ -118,10 +118,12 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
                 continue
             try:
                 number = float(raw)
-            except ValueError:
+            except (ValueError, TypeError):
+                number = math.nan
+            if not math.isfinite(number):
                 raise ConfigError(
-                    f"config {path}: {key} = {raw!r} in [{section}]; expected a number"
-                ) from None
+                    f"config {path}: {key} = {raw!r} in [{section}]; expected a number, finite"
+                )
             if prefix in _CLASSIC_REGIONS:
                 regions.setdefault(prefix, {})[key.removeprefix(prefix + "_")] = int(number)
             elif key == "camera_hz":
@@ -141,10 +143,6 @@ def from_classic(text: str, path: Path) -> dict[str, Any]:
     for kernel in ("excite", "inhibit"):  # the classic file has one width for position and heading
         if f"{kernel}_std_xy" in cells:
             cells[f"{kernel}_std_theta"] = cells[f"{kernel}_std_xy"]
-    if not math.isfinite(values.get("frame_rate_hz", 1.0)):
-        raise ConfigError(
-            f"config {path}: camera_hz is {values['frame_rate_hz']}; expected a finite number"
-        )
     return values
 
 

@@ -1,6 +1,6 @@
 """Presets, config files and assignments, read as nested values; a config written as TOML."""
 
-import tomllib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from neuroslam.config.brain import BrainConfig
 from neuroslam.config.classic import from_classic
 from neuroslam.errors import ConfigError, did_you_mean, with_new_names
+from neuroslam.limits import MOST_CONFIG_BYTES, NotReadableError, parse_toml, read_bounded
 
 
 def preset_folder() -> Path:
@@ -44,18 +45,20 @@ def read_config_file(path: Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, MOST_CONFIG_BYTES).decode()
     except FileNotFoundError:
         preset = path.name.removesuffix(".toml")
         hint = f"; {preset} is a preset, --preset {preset}" if preset in preset_names() else ""
         raise ConfigError(f"config {path}: no such file{hint}") from None
+    except NotReadableError as error:
+        raise ConfigError(f"config {path}: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"config {path}: cannot be read as text ({error})") from None
     if path.suffix.lower() in (".ini", ".txt"):
         return from_classic(text, path)
     try:
-        return _with_new_keys(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+        return _with_new_keys(parse_toml(text))
+    except ValueError as error:
         raise ConfigError(f"config {path}: not valid TOML: {error}") from None
 
 
@@ -88,8 +91,8 @@ def parse_assignment(text: str) -> dict[str, Any]:
         raise ConfigError(f"--set {text!r}: expected section.key=value, e.g. view.threshold=0.04")
     value: Any
     try:
-        value = tomllib.loads(f"value = {raw.strip()}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = parse_toml(f"value = {raw.strip()}")["value"]
+    except ValueError:
         value = raw.strip()
     for part in reversed(key.strip().split(".")):
         value = {part: value}
@@ -126,14 +129,23 @@ def build_config(values: dict[str, Any], origin: str = "config") -> BrainConfig:
             message = f"is a section; set one of its keys, as {where}.KEY"
         elif where.endswith(("crop", "region")):
             message = "expected four whole numbers x_min, x_max, y_min, y_max"
-        raise ConfigError(f"{origin}: {where} = {first['input']!r}: {message}") from None
+        raise ConfigError(f"{origin}: {where} = {_shown(first['input'])}: {message}") from None
+
+
+def _shown(value: object) -> str:
+    """Write a value for a message, cut if it is long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits
+        return f"<{type(value).__name__}>"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def to_toml(config: BrainConfig) -> str:
     """Return the complete config as TOML; reading it back gives the same config.
 
     Example:
-        >>> build_config(tomllib.loads(to_toml(BrainConfig()))) == BrainConfig()
+        >>> build_config(parse_toml(to_toml(BrainConfig()))) == BrainConfig()
         True
     """
     return "\n".join(_toml_table(config.model_dump(), "")) + "\n"
@@ -148,11 +160,21 @@ def _toml_table(values: dict[str, Any], path: str) -> list[str]:
     return lines
 
 
+def toml_text(value: str) -> str:
+    r"""Write a string as TOML, with control characters escaped.
+
+    Example:
+        >>> print(toml_text('a"b\x7f'))
+        "a\"b\u007F"
+    """
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+
+
 def _toml(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return toml_text(value)
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     return repr(value)

@@ -5,6 +5,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from neuroslam.config.bounds import LARGEST_SEED, MOST_CELLS, MOST_MODULES, MOST_STEPS
 from neuroslam.config.section import Section
 
 _SPACING_RATIO = 1.3  # spacing of a grid module over that of the next smaller one
@@ -17,12 +18,14 @@ class BoundaryCellConfig(Section):
     n_bearings: int = Field(
         default=24,
         ge=3,
+        le=MOST_CELLS,
         description="number of preferred bearings, evenly over the full turn; larger: finer "
         "bearing",
     )
     n_distances: int = Field(
         default=7,
         ge=1,
+        le=MOST_CELLS,
         description="number of preferred distances, evenly up to reach_m; larger: finer distance",
     )
     reach_m: float = Field(
@@ -54,6 +57,7 @@ class BoundaryCellConfig(Section):
     sheet_bearings: int = Field(
         default=72,
         ge=16,
+        le=MOST_CELLS,
         description="cells of the sheet around the full turn, if wall_memory.senses is "
         "boundary_cells; larger: finer bearing, slower",
     )
@@ -90,24 +94,28 @@ class GridCellConfig(Section):
     spacings_m: tuple[float, ...] = Field(
         default=(0.35, 0.46, 0.60, 0.78),
         min_length=1,
+        max_length=MOST_MODULES,
         description="distance of neighbouring firing fields, one for each module; ratios near 1.3 "
         "make positions distinct. If only orientations_deg is set: the first of these, each "
         "further one 1.3 times the one before",
     )
     orientations_deg: tuple[float, ...] = Field(
         default=(0.0, 15.0, -10.0, 7.0),
+        max_length=MOST_MODULES,
         description="orientation of the grid axes, one for each module. If only spacings_m is set: "
         "the first of these, then 37.08 k degrees for module k (from 0), wrapped to [-30, 30)",
     )
     directions: int = Field(
         default=6,
         ge=3,
+        le=MOST_CELLS,
         description="preferred directions of the oscillators of a module; only 6 gives hexagonal "
         "fields",
     )
     n_cells: int = Field(
         default=24,
         ge=1,
+        le=MOST_CELLS,
         description="cells of a module; larger: positions are told apart better, each step takes "
         "longer",
     )
@@ -168,13 +176,19 @@ class GridCellConfig(Section):
     development_steps: int = Field(
         default=1000,
         ge=0,
+        le=MOST_STEPS,
         description="learning steps at random positions before the first frame; larger: cleaner "
         "hexagons, a slower start; 0: random weights",
     )
     learns_online: bool = Field(
         default=False, description="continue learning while the animal moves"
     )
-    seed: int = Field(default=0, ge=0, description="seed of the random weights before development")
+    seed: int = Field(
+        default=0,
+        ge=0,
+        le=LARGEST_SEED,
+        description="seed of the random weights before development",
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -1,15 +1,17 @@
 """Sections of a brain's config: odometry, views, pose cells, map and sessions."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from neuroslam.config.bounds import MOST_CELLS, MOST_COUNT, MOST_IMAGE_PX, MOST_LOOPS, MOST_PX
 from neuroslam.config.section import Section
 from neuroslam.errors import did_you_mean
 from neuroslam.types import GreyRule
 
-Region = tuple[int, int, int, int]
+_Edge = Annotated[int, Field(ge=-1, le=MOST_IMAGE_PX)]
+Region = tuple[_Edge, _Edge, _Edge, _Edge]
 """Part of an image: ``x_min, x_max, y_min, y_max`` in px, the maxima excluded; -1 as a maximum is
 the edge of the image."""
 
@@ -46,6 +48,7 @@ class OdometryConfig(Section):
     max_shift_px: int = Field(
         default=40,
         ge=1,
+        le=MOST_PX,
         description="largest shift between two successive images, in px; larger: faster turns are "
         "measured, each frame takes longer",
     )
@@ -102,11 +105,13 @@ class ViewConfig(Section):
     template_width: int = Field(
         default=60,
         ge=2,
+        le=MOST_PX,
         description="width of a template in px; larger: more detail, similar scenes are told apart",
     )
     template_height: int = Field(
         default=10,
         ge=1,
+        le=MOST_PX,
         description="height of a template in px; larger: more detail, similar scenes are told "
         "apart",
     )
@@ -120,6 +125,7 @@ class ViewConfig(Section):
     shift_match: int = Field(
         default=4,
         ge=0,
+        le=MOST_PX,
         description="largest horizontal shift tried when comparing forward views, in template px; "
         "larger: tolerates more difference in heading. If not set and the template is narrower "
         "than 9 px: the largest that leaves a column",
@@ -127,6 +133,7 @@ class ViewConfig(Section):
     shift_step: int = Field(
         default=1,
         ge=1,
+        le=MOST_PX,
         description="step between the shifts tried, in template px; larger: faster, less exact",
     )
     panoramic: bool = Field(
@@ -143,6 +150,7 @@ class ViewConfig(Section):
     patch_radius: int = Field(
         default=0,
         ge=0,
+        le=MOST_PX,
         description="half width of the window of patch normalisation, in template px; larger: "
         "evens out brightness over larger areas; 0: off",
     )
@@ -211,12 +219,14 @@ class PoseCellConfig(Section):
     n_xy: int = Field(
         default=21,
         ge=7,
+        le=MOST_CELLS,
         description="cells along x and along y; larger: activity repeats at larger distances, each "
         "step takes longer. The torus wraps around, so the map is not bounded",
     )
     n_theta: int = Field(
         default=36,
         ge=7,
+        le=MOST_CELLS,
         description="cells over the full turn of heading; larger: finer heading, each step takes "
         "longer",
     )
@@ -228,6 +238,7 @@ class PoseCellConfig(Section):
     excite_size: int = Field(
         default=7,
         ge=1,
+        le=MOST_CELLS,
         description="width of the excitation kernel in cells, odd; larger: excitation reaches "
         "farther",
     )
@@ -246,6 +257,7 @@ class PoseCellConfig(Section):
     inhibit_size: int = Field(
         default=5,
         ge=1,
+        le=MOST_CELLS,
         description="width of the inhibition kernel in cells, odd; larger: inhibition reaches "
         "farther",
     )
@@ -287,6 +299,7 @@ class PoseCellConfig(Section):
     inject_after: int = Field(
         default=10,
         ge=0,
+        le=MOST_COUNT,
         description="number of newest views that never inject; larger: the robot must be away "
         "longer before a view corrects it",
     )
@@ -313,6 +326,7 @@ class PoseCellConfig(Section):
     decode_radius: int = Field(
         default=3,
         ge=0,
+        le=MOST_CELLS,
         description="cells on each side of the most active cell that are averaged to decode the "
         "pose; larger: smoother, but takes in other packets",
     )
@@ -355,6 +369,7 @@ class MapConfig(Section):
     loops: int = Field(
         default=20,
         ge=0,
+        le=MOST_LOOPS,
         description="relaxation loops a frame while the map has not converged; larger: the map "
         "converges in fewer frames, each takes longer",
     )
@@ -393,6 +408,7 @@ class SessionConfig(Section):
     confirm: int = Field(
         default=4,
         ge=1,
+        le=MOST_COUNT,
         description="matched pairs of experiences that must agree on the alignment before two maps "
         "are joined; larger: safer, later; 1: the first view match decides",
     )

@@ -8,6 +8,13 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from neuroslam.config.bounds import (
+    LARGEST_SEED,
+    MOST_AXES,
+    MOST_FREQUENCIES,
+    MOST_MODULES,
+    MOST_NEURONS,
+)
 from neuroslam.config.section import Section
 
 
@@ -22,23 +29,27 @@ class SSPSpaceConfig(Section):
     dimension: int = Field(
         default=2,
         ge=1,
+        le=MOST_AXES,
         description="dimensions of the space; if not set, as many as length_scale_m or reach_m has "
         "numbers",
     )
     n_rotations: int = Field(
         default=3,
         ge=1,
+        le=MOST_MODULES,
         description="orientations of the grid modules; larger: sharper similarity, more neurons",
     )
     n_scales: int = Field(
         default=3,
         ge=1,
+        le=MOST_MODULES,
         description="spacings of the grid modules for each orientation; larger: fewer side lobes, "
         "more neurons",
     )
     n_random: int = Field(
         default=27,
         ge=1,
+        le=MOST_FREQUENCIES,
         description="frequencies of a random space; larger: fewer side lobes, more neurons",
     )
     scale_min: float = Field(
@@ -66,7 +77,9 @@ class SSPSpaceConfig(Section):
         description="positions are decoded in [-reach, reach], one number or one for each axis; "
         "larger: a larger space, slower decoding",
     )
-    seed: int = Field(default=0, ge=0, description="seed of random frequencies and rotations")
+    seed: int = Field(
+        default=0, ge=0, le=LARGEST_SEED, description="seed of random frequencies and rotations"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -137,7 +150,10 @@ class PathIntegratorConfig(Section):
     """Velocity-controlled oscillators: one population of neurons for each frequency."""
 
     neurons: int = Field(
-        default=800, ge=10, description="neurons of each oscillator; larger: less drift"
+        default=800,
+        ge=10,
+        le=MOST_NEURONS,
+        description="neurons of each oscillator; larger: less drift",
     )
     max_speed_m_s: float = Field(
         default=0.5,
@@ -191,6 +207,7 @@ class PathIntegratorConfig(Section):
     velocity_neurons: int = Field(
         default=0,
         ge=0,
+        le=MOST_NEURONS,
         description="neurons that represent the velocity, in tiers of neurons; larger: less "
         "noise; 0: the exact velocity",
     )
@@ -208,6 +225,7 @@ class SemanticMapConfig(Section):
     neurons: int = Field(
         default=550,
         ge=10,
+        le=MOST_NEURONS,
         description="neurons each of memory, recall and error; larger: more landmarks, less noise",
     )
     intercept: float = Field(
@@ -264,7 +282,9 @@ class SSPSLAMConfig(Section):
         le=0.1,
         description="time step of the simulation; larger: faster, less exact",
     )
-    seed: int = Field(default=0, ge=0, description="seed of neurons, noise and pointers")
+    seed: int = Field(
+        default=0, ge=0, le=LARGEST_SEED, description="seed of neurons, noise and pointers"
+    )
     space: SSPSpaceConfig = SSPSpaceConfig()
     neurons: NeuronConfig = NeuronConfig()
     integrator: PathIntegratorConfig = PathIntegratorConfig()
@@ -276,11 +296,13 @@ class SSPSLAMConfig(Section):
     binding_neurons: int = Field(
         default=50,
         ge=2,
+        le=MOST_NEURONS,
         description="neurons of each product of two numbers in a binding; larger: less noise",
     )
     vector_neurons: int = Field(
         default=550,
         ge=0,
+        le=MOST_NEURONS,
         description="object-vector cells, which represent the displacement to a landmark; larger: "
         "less noise; 0: the exact displacement",
     )
@@ -297,6 +319,7 @@ class SSPSLAMConfig(Section):
     grid_neurons: int = Field(
         default=0,
         ge=0,
+        le=MOST_NEURONS,
         description="grid cells that represent the position; larger: less noise; 0: the exact "
         "pointer",
     )
@@ -368,11 +391,13 @@ class RoomSpaceConfig(SSPSpaceConfig):
     n_rotations: int = Field(
         default=5,
         ge=1,
+        le=MOST_MODULES,
         description="orientations of the grid modules; larger: sharper similarity, more neurons",
     )
     n_scales: int = Field(
         default=5,
         ge=1,
+        le=MOST_MODULES,
         description="spacings of the grid modules for each orientation; larger: fewer side lobes, "
         "more neurons",
     )
@@ -439,6 +464,7 @@ class SemanticConfig(SSPSLAMConfig):
     key_features: int = Field(
         default=256,
         ge=16,
+        le=MOST_FREQUENCIES,
         description="length of a landmark's pointer; larger: more landmarks are told apart",
     )
     same_m: float = Field(

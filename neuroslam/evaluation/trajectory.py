@@ -9,6 +9,7 @@ import numpy as np
 
 from neuroslam.errors import MapError, SourceError
 from neuroslam.geometry import relative_poses
+from neuroslam.limits import read_table
 from neuroslam.state.files import write_atomically
 
 AlignmentMode = Literal["none", "rigid", "similarity"]
@@ -288,10 +289,10 @@ def read_tum_file(path: Path, on_bad_line: Callable[[str], object] | None = None
         SourceError: If the file is missing or a line is invalid; the message has its number.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        lines = read_table(Path(path)).splitlines()
     except FileNotFoundError:
         raise SourceError(f"trajectory {path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise SourceError(f"trajectory {path}: cannot be read as text ({error})") from None
     rows: list[list[float]] = []
     faults: list[str] = []

@@ -29,13 +29,16 @@ _LABELLED = 40  # landmarks; more are labelled only if they are found
 _MARGIN = 0.08  # around all that is drawn, as a share of its size
 
 
-def plot_answer(answer: Answer, positions_m: np.ndarray, links: np.ndarray) -> Figure:
+def plot_answer(
+    answer: Answer, positions_m: np.ndarray, links: np.ndarray, unit: str = "m"
+) -> Figure:
     """Draw all that a semantic map knows, and the answer to a question.
 
     Args:
         answer: From :func:`neuroslam.spiking.ask.ask`.
         positions_m: Positions of the experiences, ``(n, 2)``.
         links: Pairs of linked experiences, ``(l, 2)``.
+        unit: Of lengths on the map.
     """
     with mpl.rc_context(STYLE):
         low, high = _extent(answer, positions_m)
@@ -53,7 +56,8 @@ def plot_answer(answer: Answer, positions_m: np.ndarray, links: np.ndarray) -> F
             _draw(axes, one, one.name in found)
         _label(axes, answer.everything, found, high - low)
         _draw_question(axes, answer.question.form, answer.question.numbers)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
         axes.set_aspect("equal")
         text = answer.question.text.strip()
         title = text[:1].upper() + text[1:]

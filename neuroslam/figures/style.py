@@ -20,6 +20,7 @@ from matplotlib.font_manager import fontManager
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import ScaledTranslation
 
+from neuroslam.errors import printable
 from neuroslam.state.files import write_atomically
 
 ODOMETRY, MAP, LOOP, TRUTH = "#8c8c8c", "#0072B2", "#D55E00", "#000000"
@@ -110,8 +111,8 @@ def write_decimals(axis: Axis) -> None:
 
 
 def plain_text(text: str) -> str:
-    """Escape a name for matplotlib, where a $ begins a formula."""
-    return text.replace("$", r"\$")
+    """Escape a name for matplotlib, where a $ begins a formula, and control characters are none."""
+    return printable(text).replace("$", r"\$")
 
 
 def shortened(name: str, most: int = 44) -> str:

@@ -49,8 +49,12 @@ class MergeReport:
         """Return everything as plain values, for ``metrics.json``."""
         return asdict(self)
 
-    def lines(self) -> list[str]:
-        """Return the report as text, one fact per line."""
+    def lines(self, unit: str = "m") -> list[str]:
+        """Return the report as text, one fact per line.
+
+        Args:
+            unit: Of lengths; ``arbitrary unit`` for maps of one camera alone.
+        """
         lines = [f"{'merged' if self.merged else 'not merged'}: {self.reason}"]
         m = self.match or {}
         if m:
@@ -72,15 +76,15 @@ class MergeReport:
             x, y = self.translation_m
             lines.append(
                 f"map turned by {np.degrees(self.rotation_rad):.1f} degrees, "
-                f"matched experience moved by {x:.2f}, {y:.2f} m"
+                f"matched experience moved by {x:.2f}, {y:.2f} {unit}"
             )
         for what, n in self.counts.items():
             into = f" -> {n['merged']}" if "merged" in n else ""
             lines.append(f"{what.replace('_', ' ')}: {n['loaded']} + {n['partial']}{into}")
         if self.residual_after_m is not None:
             lines.append(
-                f"residual of links {self.residual_before_m:.4f} m before, "
-                f"{self.residual_after_m:.4f} m after relaxation (RMS); "
-                f"largest correction {self.largest_correction_m:.3f} m"
+                f"residual of links {self.residual_before_m:.4f} {unit} before, "
+                f"{self.residual_after_m:.4f} {unit} after relaxation (RMS); "
+                f"largest correction {self.largest_correction_m:.3f} {unit}"
             )
         return lines

@@ -135,7 +135,7 @@ function paintPlaceCells(pen, width, height) {
   const inner = [width - 56, height - 42], span = 1.08 * Math.max((x1 - x0) / inner[0], (y1 - y0) / inner[1], 1e-3);
   const cx = (x0 + x1) / 2, cy = (y0 + y1) / 2;
   const { x, y } = axes(pen, width, height, [cx - (span * inner[0]) / 2, cx + (span * inner[0]) / 2],
-    [cy - (span * inner[1]) / 2, cy + (span * inner[1]) / 2], "x (m)", "y (m)");
+    [cy - (span * inner[1]) / 2, cy + (span * inner[1]) / 2], `x (${about.unit})`, `y (${about.unit})`);
   drawWalls(pen, { sx: x, sy: y });
   pen.strokeStyle = colours.link;
   pen.lineWidth = 0.8;

@@ -197,7 +197,7 @@ function startCharts() {
   };
   curve("doubt_s", "Time without recognition", "seconds; rises while walls disagree with the map; the animal is lost above a threshold", () => colours.match, { low: 0 });
   curve("peak", "Peak activity of the pose cells", "share of the total activity", () => colours.path, { low: 0 });
-  curve("largest_correction", "Relaxation", "largest correction of a pose in a frame, m or rad", () => colours.second, { low: 0 });
+  curve("largest_correction", "Relaxation", `largest correction of a pose in a frame, ${about.unit} or rad`, () => colours.second, { low: 0 });
   add("Speed", "m/s", 90, [{ name: "v", colour: () => colours.map, value: column("row_v_m_s") }]);
   add("Turn rate", "degrees/s; left is positive", 90, [{ name: "ω", digits: 1, colour: () => colours.path, value: (i) => (run.row_w_rad_s[i] * 180) / Math.PI }]);
   watch("row", () => charts.forEach((chart) => chart.mark()));

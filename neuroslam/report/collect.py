@@ -19,7 +19,7 @@ from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.report.rows import config_rows, metric_rows
-from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses
+from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses, unit_of
 from neuroslam.spiking.ask import contents
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.state.answers import counts_of, pictures_of
@@ -65,6 +65,7 @@ def collect(run: FinishedRun) -> Facts:
         }
     about = {
         "name": run.plan.name,
+        "unit": _unit(run),
         "cells": list(run.brain.config.cells),
         "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
         "threshold": run.brain.config.view.threshold,
@@ -76,7 +77,7 @@ def collect(run: FinishedRun) -> Facts:
         "refused": [_merge(report, run) for report in run.metrics["refused_merges"]],
         "not_joined": run.metrics.get("not_joined", []),
         "skipped": run.metrics.get("skipped", []),
-        "metrics": metric_rows(run.metrics),
+        "metrics": metric_rows(run.metrics, _unit(run)),
         "config": config_rows(run.brain.config),
         "range": {"start": run.plan.start, "stop": run.plan.stop,
                   "on_bad_frame": run.plan.on_bad_frame},
@@ -370,13 +371,17 @@ def _sessions(run: FinishedRun) -> list[dict[str, Any]]:
     ]
 
 
+def _unit(run: FinishedRun) -> str:
+    return unit_of(run.metrics.get("measured_motion"))
+
+
 def _merge(report: dict[str, Any], run: FinishedRun) -> dict[str, Any]:
     """Return the lines of a merge report, and the experience of the merge on the final map."""
     place = None
     if report["at_frame"] is None and report["merged"] and report == run.brain.sessions.merges[-1]:
         place = report["match"].get("loaded_experience")  # ids before a later merge are not valid
     return {
-        "lines": MergeReport(**report).lines(),
+        "lines": MergeReport(**report).lines(_unit(run)),
         "frame": report["at_frame"],
         "place": place,
         "loaded": report["loaded_sessions"],

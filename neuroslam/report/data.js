@@ -117,7 +117,7 @@ function make(tag, settings = {}, ...children) {
 }
 
 const many = (n, noun) => `${n.toLocaleString("en")} ${noun}${n === 1 ? "" : "s"}`;
-const metres = (m) => (Math.abs(m) < 1 ? `${(100 * m).toFixed(1)} cm` : `${m.toFixed(2)} m`);
+const metres = (m) => (about.unit !== "m" ? `${m.toFixed(2)} ${about.unit}` : Math.abs(m) < 1 ? `${(100 * m).toFixed(1)} cm` : `${m.toFixed(2)} m`);
 const degrees = (rad) => `${((rad * 180) / Math.PI).toFixed(1)}°`;
 
 function duration(s) {

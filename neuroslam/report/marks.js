@@ -19,7 +19,7 @@ function drawGrid(pen, at) {
   pen.textBaseline = "middle";
   for (const y of up.ticks) if (at.sy(y) > 50 && at.sy(y) < at.height - 26) pen.fillText(y.toFixed(up.digits), 6, at.sy(y));
   pen.textBaseline = "bottom";
-  pen.fillText("m", 6, at.height - 6);
+  pen.fillText(about.unit, 6, at.height - 6);
 }
 
 function ring(pen, x, y, radius, colour, width) {

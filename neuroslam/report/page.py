@@ -31,7 +31,11 @@ _EXACT = ("row_time_s",)  # Unix times have more digits than four bytes hold
 
 
 def write_report(
-    out: str | Path, to: str | Path | None = None, *, pictures_mb: float = PICTURES_MB
+    out: str | Path,
+    to: str | Path | None = None,
+    *,
+    pictures_mb: float = PICTURES_MB,
+    source: bool = False,
 ) -> Path:
     """Write one HTML page about a run: its map, frames, cells and metrics.
 
@@ -41,7 +45,10 @@ def write_report(
         out: Folder that ``run``, ``resume`` or ``merge`` wrote.
         to: File to write; ``report.html`` in that folder if not given.
         pictures_mb: Largest size of all pictures of frames, in 1e6 bytes of the page; 0: no
-            pictures, and sources are not opened.
+            pictures.
+        source: Open the recordings and cameras that the folder names, and the folders of the maps
+            that it names, for pictures of frames. Off: nothing but the folder is opened, and only
+            rendered worlds have pictures; a folder from elsewhere can name any file and address.
 
     Returns:
         The file written.
@@ -59,7 +66,7 @@ def write_report(
     if to.resolve() in {(out / name).resolve() for name in run_files(out)}:
         raise RunError(f"{to}: is a file of the run and would be overwritten; give another name")
     run = read_run(out)
-    page = make_page(collect(run), take_pictures(run, int(1e6 * pictures_mb)))
+    page = make_page(collect(run), take_pictures(run, int(1e6 * pictures_mb), source))
     try:
         write_text(to, page)
     except OSError as error:

@@ -96,7 +96,7 @@ function showNow() {
   const poses = !about.cells.includes("pose") ? null
     : `${run.row_pose_x[row].toFixed(1)}, ${run.row_pose_y[row].toFixed(1)}, ${run.row_pose_theta[row].toFixed(1)} cells`;
   const at = run.row_x_m[row] === run.row_x_m[row]
-    ? `${run.row_x_m[row].toFixed(2)} m, ${run.row_y_m[row].toFixed(2)} m, ${degrees(run.row_theta_rad[row])}`
+    ? `${run.row_x_m[row].toFixed(2)}, ${run.row_y_m[row].toFixed(2)} ${about.unit}, ${degrees(run.row_theta_rad[row])}`
     : "on a map that is not joined";
   panel.replaceChildren(
     make("span", { class: `act ${lost ? "lost" : action}`, text: lost ? "lost: walls disagree with the map" : place < 0 ? "no experience of this map" : ACTION_TEXT[action] }),
@@ -109,7 +109,7 @@ function showNow() {
       ["frame", `${frame}, ${duration(run.row_time_s[row] - run.row_time_s[0])} after the start`],
       ["experience", place >= 0 ? placeButton(place) : "none"],
       ["position", at],
-      ["motion", `${run.row_v_m_s[row].toFixed(2)} m/s, ${degrees(run.row_w_rad_s[row])}/s`],
+      ["motion", `${run.row_v_m_s[row].toFixed(2)} ${about.unit}/s, ${degrees(run.row_w_rad_s[row])}/s`],
       ["match error", hasViews ? matchMeter(error) : null],
       ["pose cells", poses],
       ["so far", `${many(run.row_n_experiences[row], "experience")}, ${many(run.row_n_links[row], "link")}`],
@@ -156,7 +156,7 @@ function showPlace() {
         template >= 0 ? templateFigure(template) : null)
       : "",
     facts([
-      ["position", `${run.place_x_m[place].toFixed(2)} m, ${run.place_y_m[place].toFixed(2)} m, ${degrees(run.place_theta_rad[place])}`],
+      ["position", `${run.place_x_m[place].toFixed(2)}, ${run.place_y_m[place].toFixed(2)} ${about.unit}, ${degrees(run.place_theta_rad[place])}`],
       ["created", `at frame ${first}` + (session?.own ? "" : " of an earlier session")],
       ["session", session ? make("span", {}, make("i", { class: "swatch", style: { background: sessionColour(run.place_session[place]) } }), session.name) : null],
       ["time spent", visits.length ? `${duration(known.seconds[place])} in ${many(visits.length, "visit")}` : "not visited in this run"],

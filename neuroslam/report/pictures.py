@@ -12,6 +12,7 @@ from neuroslam.errors import SourceError
 from neuroslam.report.reading import FinishedRun, session_plans
 from neuroslam.runs.files import RunPlan
 from neuroslam.sensors import Source, open_source
+from neuroslam.sensors.open import is_rendered
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.types import Frame
 
@@ -55,7 +56,7 @@ class Pictures(NamedTuple):
     notes: list[str]
 
 
-def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
+def take_pictures(run: FinishedRun, budget_bytes: int, source: bool = True) -> Pictures:
     """Take pictures of the first frames of experiences, and of frames at regular intervals.
 
     If they exceed the budget, a regular subset is kept.
@@ -63,15 +64,17 @@ def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
     Args:
         run: The run.
         budget_bytes: Largest size of all pictures, as base64 text; 0: no source is opened.
+        source: Open what the run names; off: only rendered worlds.
     """
     notes: list[str] = []
-    firsts, missing = _first_frames(run)
+    firsts, missing = _first_frames(run, source)
     taken: dict[SourceFrame, bytes] = {}
     if budget_bytes:
         if missing:
+            why = "has been moved or deleted" if source else "is not opened without --source"
             notes.append(
                 f"No pictures of {missing:,} experiences: the folder of the run that made them "
-                "has been moved or deleted."
+                f"{why}."
             )
         sources: dict[str, set[int]] = defaultdict(set)
         for wanted in _thinned([first for first in firsts if first is not None], MOST // 2):
@@ -80,6 +83,12 @@ def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
         if frames:
             sources[run.plan.source].update(_thinned(frames, MOST // 2))
         for spec, numbers in sources.items():
+            if not (source or is_rendered(spec)):
+                notes.append(
+                    f"No pictures of {RunPlan(spec).name}: the source of a run is opened only if "
+                    "asked, with --source."
+                )
+                continue
             found, note = _from_source(spec, sorted(numbers), run.brain.config)
             taken |= {SourceFrame(spec, number): file for number, file in found.items()}
             notes += [note] if note else []
@@ -102,9 +111,9 @@ def take_pictures(run: FinishedRun, budget_bytes: int) -> Pictures:
     return Pictures([taken[wanted] for wanted in at], at, place, row, notes)
 
 
-def _first_frames(run: FinishedRun) -> tuple[list[SourceFrame | None], int]:
+def _first_frames(run: FinishedRun, source: bool) -> tuple[list[SourceFrame | None], int]:
     """Return the first frame of each experience, ``None`` if its source is unknown; count those."""
-    plans, table = session_plans(run), run.brain.map.experiences
+    plans, table = session_plans(run, source), run.brain.map.experiences
     rows = zip(table["session"].tolist(), table["first_frame"].tolist(), strict=True)
     firsts = [
         SourceFrame(plans[session].source, frame) if session in plans else None

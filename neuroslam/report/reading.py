@@ -104,11 +104,15 @@ def read_curves(out: Path, frames: np.ndarray) -> dict[str, Curve]:
     return curves
 
 
-def session_plans(run: FinishedRun) -> dict[int, RunPlan]:
+def session_plans(run: FinishedRun, others: bool = True) -> dict[int, RunPlan]:
     """Find the plan of the run of each session of a map, as far as their folders exist.
 
     The folder of a run names its source and the stored maps that it joined; their folders in turn
     name their sources.
+
+    Args:
+        run: The run.
+        others: Read the folders of stored maps too.
 
     Returns:
         Session id -> plan of the run that made it.
@@ -123,6 +127,8 @@ def session_plans(run: FinishedRun) -> dict[int, RunPlan]:
         for session in brain.sessions.sessions:
             if session.name in drive and not merged:
                 plans.setdefault(session.id, plan)
+        if not others:
+            break
         for path in map(Path, (plan.source, *plan.maps) if merged else plan.maps):
             if path in visited:
                 continue

@@ -21,8 +21,12 @@ _USED_BY = {
 """Section of the config -> the cells that use it; other sections are always in use."""
 
 
-def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
+def metric_rows(metrics: dict[str, Any], length: str = "m") -> list[list[Any]]:
     """Return name, value and unit of the numbers in ``metrics.json``; lists are shown elsewhere.
+
+    Args:
+        metrics: The figures.
+        length: Unit of lengths; ``arbitrary unit`` for one camera alone.
 
     Example:
         >>> metric_rows({"frames": 3, "seconds": 1.5, "skipped": [], "ate_rmse_m": 0.2})
@@ -35,6 +39,8 @@ def metric_rows(metrics: dict[str, Any]) -> list[list[Any]]:
         name, unit = key, ""
         if key.endswith(("_m", "_s")) and "_per_" not in key:
             name, _, unit = key.rpartition("_")
+            # With a free scale, errors are in the metres of the truth.
+            unit = length if unit == "m" and "similarity" not in key else unit
         finite = not isinstance(value, float) or math.isfinite(value)
         rows.append([name.replace("_", " "), value if finite else str(value), unit])
     return rows

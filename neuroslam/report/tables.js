@@ -3,7 +3,7 @@
 
 function startHeadline() {
   const s = about.summary, parts = [];
-  if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} m driven`);
+  if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} ${about.unit} driven`);
   parts.push(many(s.places, "experience"), many(s.loop_closures, "loop closure"));
   if (about.sessions.length > 1) parts.push(many(about.sessions.length, "session"));
   if (about.merges.length) parts.push(many(about.merges.length, "merge"));
@@ -126,7 +126,7 @@ function startNotes() {
   const notes = [
     "Experiences, links and the path are those of the final map: a frame keeps its offset from its experience, so the path moves with the map.",
     "The path follows the slider; experiences become opaque at their first visit. A loop closure is a link between experiences that both existed before it.",
-    ...(run.row_truth_x_m ? [`The truth is aligned to the path by a similarity transform: one metre of the map is ${figure(about.truth_scale)} m. The errors among the metrics are without scaling.`] : []),
+    ...(run.row_truth_x_m ? [`The truth is aligned to the path by a similarity transform: one ${about.unit === "m" ? "metre" : about.unit} of the map is ${figure(about.truth_scale)} m. The errors among the metrics are without scaling.`] : []),
     ...about.notes, ...about.picture_notes,
     pictures.length ? `The page has ${many(pictures.length, "picture")} of frames; it shows the nearest one at or before the slider.` : "The page has no pictures of frames.",
     "The page is a single file and makes no network requests.",

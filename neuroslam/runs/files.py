@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import json
 import math
 import os
 from collections.abc import Iterator
@@ -14,7 +13,9 @@ import numpy as np
 from pydantic import ConfigDict
 
 from neuroslam.brain import NavigationBrain
-from neuroslam.errors import RunError, counted
+from neuroslam.config.files import toml_text
+from neuroslam.errors import RunError, counted, printable
+from neuroslam.limits import MOST_JSON_BYTES, parse_json, read_bounded
 from neuroslam.mapping.tables import Links
 from neuroslam.runs.manifest import MANIFEST, ROWS, Extent, check_saved
 from neuroslam.runs.saves import settle
@@ -63,7 +64,7 @@ class RunPlan:
     @property
     def name(self) -> str:
         """Short name of the source: the last two parts of its path."""
-        return "/".join(Path(self.source).parts[-2:])
+        return printable("/".join(Path(self.source).parts[-2:]))
 
     @property
     def skips(self) -> bool:
@@ -72,16 +73,16 @@ class RunPlan:
 
     def to_toml(self) -> str:
         """Write the table."""
-        lines = [f"source = {json.dumps(self.source, ensure_ascii=False)}", f"start = {self.start}"]
+        lines = [f"source = {toml_text(self.source)}", f"start = {self.start}"]
         if self.stop is not None:
             lines.append(f"stop = {self.stop}")
         lines.append(f'on_bad_frame = "{self.on_bad_frame}"')
         if self.maps:
-            lines.append(f"maps = {json.dumps(self.maps, ensure_ascii=False)}")
+            lines.append(f"maps = [{', '.join(map(toml_text, self.maps))}]")
         if self.truth:
-            lines.append(f"truth = {json.dumps(self.truth, ensure_ascii=False)}")
+            lines.append(f"truth = {toml_text(self.truth)}")
         if self.axes:
-            lines.append(f"axes = {json.dumps(self.axes)}")
+            lines.append(f"axes = {toml_text(self.axes)}")
         return "\n".join(["\n[run]", *lines]) + "\n"
 
 
@@ -126,7 +127,7 @@ def refuse_many(out: Path) -> None:
 def run_files(out: Path) -> tuple[str, ...]:
     """Name all files of a run, including the tables that its populations have written."""
     try:
-        tables = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["tables"]
+        tables = parse_json(read_bounded(out / "metrics.json", MOST_JSON_BYTES))["tables"]
         own = [name for name in tables if isinstance(name, str) and Path(name).name == name]
     except (OSError, ValueError, KeyError, TypeError):  # no run, or one of an older version
         own = []

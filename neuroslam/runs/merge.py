@@ -14,7 +14,7 @@ from neuroslam.runs.manifest import copy_saved
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.results import RunSaver, RunSummary, write_results
 from neuroslam.runs.saves import final, writing
-from neuroslam.threads import limit_threads
+from neuroslam.threads import limit_threads, usable_threads
 
 _REST_LOOPS = 5000
 """Most relaxation loops after a merge; a large map relaxes further when it is used."""
@@ -131,7 +131,7 @@ def merge_runs(
     if confirm is not None:
         sessions = partial.config.sessions.model_copy(update={"confirm": confirm})
         partial.config = partial.config.model_copy(update={"sessions": sessions})
-    with limit_threads(partial.config.threads), torch.inference_mode():
+    with limit_threads(usable_threads(partial.config.threads)), torch.inference_mode():
         merged, reports = join_brains(loaded, partial)
         if merged is None:
             return None, reports

@@ -20,7 +20,12 @@ from typing import Any, TypeVar
 from neuroslam.config.populations import PLUGINS, known_kinds
 from neuroslam.errors import NeuroslamError, RunError
 from neuroslam.interrupts import end_runs
+from neuroslam.limits import MAX_MEMORY
 from neuroslam.threads import limit_threads
+
+_RAY_CLUSTER = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Environment variable that, as ``0``, lets a Ray that is started here listen on the loopback
+address only, on any system; Ray reads it when it is imported."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -192,6 +197,8 @@ def _died() -> RunError:
 def _on_ray(
     function: Callable[[T], R], numbered: Mapping[int, T], jobs: int | None, address: str
 ) -> Iterator[tuple[int, R | NeuroslamError]]:
+    if address == "local":
+        os.environ.setdefault(_RAY_CLUSTER, "0")  # no other machine reaches it
     try:
         import ray
         from ray.exceptions import OutOfMemoryError, WorkerCrashedError
@@ -205,12 +212,12 @@ def _on_ray(
     running: dict[Any, int] = {}
     try:
         task: Any = ray.remote(num_cpus=1, max_retries=0)(_attempt_on_ray)
-        plugins = os.environ.get(PLUGINS, "")
+        settings = {name: os.environ.get(name, "") for name in (PLUGINS, MAX_MEMORY)}
         waiting = deque(numbered.items())
         while waiting or running:
             while waiting and (jobs is None or len(running) < jobs):
                 number, item = waiting.popleft()
-                running[task.remote(plugins, pickle.dumps((function, item)))] = number
+                running[task.remote(settings, pickle.dumps((function, item)))] = number
             (done,), _ = ray.wait(list(running), num_returns=1)
             number = running.pop(done)
             try:
@@ -225,15 +232,15 @@ def _on_ray(
             ray.shutdown()
 
 
-def _attempt_on_ray(plugins: str, call: bytes) -> object:
+def _attempt_on_ray(settings: dict[str, str], call: bytes) -> object:
     """Attempt a call in a worker, which gets no environment of this process.
 
     Args:
-        plugins: Value of :data:`~neuroslam.config.populations.PLUGINS`.
+        settings: Environment variables with the plugins and the budget of memory.
         call: Function and item, pickled: an item can hold a config, whose populations have to be
             known when it is unpickled.
     """
-    os.environ[PLUGINS] = plugins
+    os.environ |= settings
     try:
         known_kinds()  # loads the plugins: the item can hold a class of one
         function, item = pickle.loads(call)

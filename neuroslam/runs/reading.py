@@ -2,7 +2,6 @@
 
 import json
 import math
-import tomllib
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,15 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, counted
 from neuroslam.geometry import compose_poses, integrate_velocities
+from neuroslam.limits import (
+    MOST_CONFIG_BYTES,
+    MOST_JSON_BYTES,
+    fits,
+    parse_json,
+    parse_toml,
+    read_bounded,
+    too_much,
+)
 from neuroslam.mapping.tables import origin_key
 from neuroslam.runs.files import (
     FRAME_COLUMNS,
@@ -53,6 +61,8 @@ def read_trace(
     path = Path(out) / "trace.f64"
     if not path.is_file():
         raise RunError(f"{path}: missing; expected the folder of a run")
+    if not fits(needed := 4 * path.stat().st_size):
+        raise RunError(f"{path}: {too_much(needed)}")
     values, width = np.fromfile(path, dtype="<f8"), len(TRACE_COLUMNS)
     there = len(values) // width
     if not path.stat().st_size and (rows or min_rows):
@@ -193,7 +203,7 @@ def read_plan(out: str | Path) -> RunPlan:
             f"{out}: the run was cut off before its first save; run again with --overwrite"
         )
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))["run"]
+        table = parse_toml(read_bounded(path, MOST_CONFIG_BYTES).decode())["run"]
         plan = _PLAN.validate_json(json.dumps(table), strict=True)
     except OSError:
         if (Path(out) / "brain.safetensors").exists():
@@ -216,7 +226,7 @@ def read_metrics(out: str | Path) -> dict[str, Any]:
     """
     path = Path(out) / "metrics.json"
     try:
-        metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        metrics: dict[str, Any] = parse_json(read_bounded(path, MOST_JSON_BYTES))
         for name, kind in _FIGURES.items():
             if not isinstance(metrics[name], kind):
                 raise TypeError(f"{name} is {metrics[name]!r}")

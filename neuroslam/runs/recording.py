@@ -108,6 +108,7 @@ class TensorBoardRecorder(Recorder):
         self._drawn = -1
         self._clock = (time.perf_counter(), 0)
         self._seen = 0
+        self._measured = False
         self._panels: dict[str, Panels] = {}
         self._panels_due = 0  # frame
         try:
@@ -119,6 +120,8 @@ class TensorBoardRecorder(Recorder):
         """Write the scalars and images that are due at this frame."""
         self._last = (result.frame, brain)
         self._seen += 1
+        measured = frame.velocity is not None and brain.config.odometry.use != "visual"
+        self._measured |= measured
         for kind, population in brain.populations.items():
             if kind in PANELS:
                 if kind not in self._panels:
@@ -185,6 +188,7 @@ class TensorBoardRecorder(Recorder):
             np.column_stack([links.source, links.target]),
             current=brain.map.pose,
             landmarks=brain.landmarks_m,
+            unit="m" if self._measured else "arbitrary unit",
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
         if last or frame >= self._panels_due:

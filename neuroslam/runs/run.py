@@ -40,7 +40,7 @@ from neuroslam.sensors.axes import parse_axes
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
-from neuroslam.threads import limit_threads
+from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.types import Frame, StepResult
 
 SAVE_EVERY_S = 60.0
@@ -181,7 +181,7 @@ def run(
         brain.store(one)
     _announce(on_start, stop, opened)
     with (
-        limit_threads(brain.config.threads),
+        limit_threads(usable_threads(brain.config.threads)),
         torch.inference_mode(),
         noting_interrupts() as interrupts,
     ):
@@ -266,7 +266,7 @@ def resume(
         onward = replace(plan, start=max(first, plan.start))
         save = RunSaver(folder, out)
         with (
-            limit_threads(brain.config.threads),
+            limit_threads(usable_threads(brain.config.threads)),
             torch.inference_mode(),
             noting_interrupts() as interrupts,
             RowWriter.reopen(out, seen) as output,

@@ -5,7 +5,6 @@ import io
 import itertools
 import json
 import re
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ from typing import Any
 
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import section_class
-from neuroslam.errors import ConfigError, NeuroslamError, RunError
+from neuroslam.errors import ConfigError, NeuroslamError, RunError, csv_text
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
+from neuroslam.limits import parse_toml
 from neuroslam.runs.files import OnBadFrame, require_free, write_text
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.run import resolve_config, run
@@ -75,8 +75,8 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
     """
     key, _, raw = (part.strip() for part in text.partition("="))
     try:
-        values = tomllib.loads(f"values = [{raw}]")["values"]
-    except tomllib.TOMLDecodeError:
+        values = parse_toml(f"values = [{raw}]")["values"]
+    except ValueError:
         values = [part.strip() for part in raw.split(",")]
     if not key or not values or "" in values:
         raise ConfigError(
@@ -354,7 +354,7 @@ def _write(out: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:
     table = csv.DictWriter(text, [*columns, "error"], lineterminator="\n")
     table.writeheader()
     for row in rows:
-        table.writerow({key: _written(value) for key, value in row.items()})
+        table.writerow({key: csv_text(_written(value)) for key, value in row.items()})
     summary = {"varied": keys, "runs": rows}
     write_text(out / "sweep.csv", text.getvalue())
     write_text(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-r"""Folders with the layout of the TUM RGB-D, KITTI odometry and EuRoC datasets.
+r"""Folders with the layout of TUM RGB-D, KITTI odometry, EuRoC, or a tub of donkeycar.
 
 Each has images with times, and may have ground-truth poses in three dimensions. The truth of a
 frame is the pose projected onto the ground plane: position, and heading of the optical axis.
@@ -9,6 +9,7 @@ KITTI         ``image_0/`` or ``image_2/``, ``times.txt``;             y is down
               ``poses.txt`` or ``../../poses/NN.txt``                  z, ground y is -x
 EuRoC         ``mav0/cam0/data.csv``, ``data/``, ``sensor.yaml``;      z is up
               ``mav0/state_groundtruth_estimate0/data.csv``
+donkeycar     ``manifest.json``, ``catalog_N.catalog``, ``images/``    no truth
 ============  =======================================================  ======================
 """
 
@@ -30,6 +31,7 @@ from neuroslam.sensors.images import (
     read_text,
 )
 from neuroslam.sensors.times import in_seconds, unit_note
+from neuroslam.sensors.tub import is_tub, open_tub
 from neuroslam.types import GreyRule
 
 MAX_GAP_S = 0.1
@@ -55,6 +57,8 @@ def open_dataset(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> I
     for mav in (path / "mav0", path):
         if (mav / "cam0" / "data.csv").is_file():
             return open_euroc(mav, frame_rate_hz, grey)
+    if is_tub(path):
+        return open_tub(path, frame_rate_hz, grey)
     if any((path / camera).is_dir() for camera in _KITTI_CAMERAS):
         return open_kitti(path, frame_rate_hz, grey)
     return None
@@ -138,9 +142,9 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
     lines = [line.split(",") for line in read_text(camera / "data.csv").splitlines()]
     lines = [line for line in lines if line[0].strip() and not line[0].startswith("#")]
     try:
-        times = np.array([int(line[0]) for line in lines]) / 1e9
+        times = np.array([int(line[0]) for line in lines], dtype=np.int64) / 1e9
         names = [line[1].strip() for line in lines]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise SourceError(
             f"{camera / 'data.csv'}: is damaged; expected lines 'time in ns,image file'"
         ) from None

@@ -12,20 +12,26 @@ a comma or blanks, or the path alone. Paths are relative to the list; a header l
 start with ``#`` are skipped.
 """
 
-import lzma
 import re
-import tarfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
+from neuroslam.limits import (
+    MOST_PIXELS,
+    NotReadableError,
+    fits,
+    read_table,
+    too_much,
+)
+from neuroslam.sensors.archives import ImageFile, read_tar
 from neuroslam.sensors.grey import to_grey
+from neuroslam.sensors.image_size import image_size
 from neuroslam.sensors.pixels import PixelScale, spread
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.times import (
@@ -41,25 +47,8 @@ from neuroslam.sensors.tracks import SLOWEST_S, Clock, Track, parse_motion
 from neuroslam.types import Frame, GreyRule, Pose
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+_PER_PIXEL = 16  # bytes at work: colour of 16 bits, grey, and copies
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
-
-
-class ImageFile(NamedTuple):
-    """Location of an encoded image: a file, a part of a file, or bytes in memory."""
-
-    name: str
-    path: Path
-    offset: int = 0
-    size: int = -1
-    data: bytes | None = None
-
-    def read(self) -> bytes:
-        """Return the bytes of the encoded image."""
-        if self.data is not None:
-            return self.data
-        with self.path.open("rb") as file:
-            file.seek(self.offset)
-            return file.read(self.size)
 
 
 class ImageSource(IndexedSource):
@@ -150,9 +139,12 @@ class ImageSource(IndexedSource):
         file = self.images[index]
         try:
             pixels = decode(file.read())
-        except OSError as error:
+        except (BadFrame, NotReadableError) as error:
+            raise BadFrame(f"{self.name}: frame {index}: {file.name} {error}") from None
+        except (OSError, ValueError) as error:  # ValueError: a NUL in a name
+            reason = getattr(error, "strerror", None) or error
             raise BadFrame(
-                f"{self.name}: frame {index}: {file.name} cannot be read ({error.strerror})"
+                f"{self.name}: frame {index}: {file.name} cannot be read ({reason})"
             ) from None
         if pixels is None:
             raise BadFrame(f"{self.name}: frame {index}: {file.name} is corrupt or not an image")
@@ -235,8 +227,15 @@ def decode(data: bytes) -> np.ndarray | None:
     Returns:
         ``(h, w, 3)`` BGR, ``uint8``, ``uint16`` or of the type of the file, or ``None`` if the
         bytes are not a complete image.
+
+    Raises:
+        BadFrame: If it has more pixels than memory allows.
     """
-    if not data or not _is_complete(data):
+    size = image_size(data)
+    if size is None:
+        return None
+    check_pixels(*size)
+    if not is_complete(data):
         return None
     with quiet_opencv():
         for flags in (cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, cv2.IMREAD_UNCHANGED):
@@ -249,7 +248,19 @@ def decode(data: bytes) -> np.ndarray | None:
     return None
 
 
-def _is_complete(data: bytes) -> bool:
+def check_pixels(height: int, width: int) -> None:
+    """Check the size of an image before its pixels take memory.
+
+    Raises:
+        BadFrame: If it has more than ``MOST_PIXELS``, or they do not fit into the budget.
+    """
+    if height * width > MOST_PIXELS:
+        raise BadFrame(f"is {width:,} x {height:,} px; expected at most {MOST_PIXELS:,} px in all")
+    if not fits(needed := _PER_PIXEL * height * width):
+        raise BadFrame(f"is {width:,} x {height:,} px, which {too_much(needed)}")
+
+
+def is_complete(data: bytes) -> bool:
     """Return False for a truncated JPEG or a damaged PNG, which decoders accept with a warning."""
     if data.startswith(b"\xff\xd8"):  # the end marker comes after the last start of a scan
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
@@ -296,16 +307,7 @@ def open_tar(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Image
     Raises:
         SourceError: If the tar is damaged or contains no images.
     """
-    try:
-        try:
-            members = _list_tar(path, "r:")
-        except tarfile.ReadError:
-            members = _list_tar(path, "r:*")
-    except (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise SourceError(
-            f"{path}: is damaged or incomplete ({reason}); expected a tar file"
-        ) from None
+    members = read_tar(path, lambda name: is_image_name(name) or name in _NOTES)
     images = [member for member in members if is_image_name(member.name)]
     notes = {
         note: to_text(member.read(), f"{path}: {member.name}")
@@ -313,20 +315,6 @@ def open_tar(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Image
         if (note := member.name.rpartition("/")[2]) in _NOTES
     }
     return _with_notes(str(path), images, notes, frame_rate_hz, grey)
-
-
-def _list_tar(path: Path, mode: Literal["r:", "r:*"]) -> list[ImageFile]:
-    found: dict[str, ImageFile] = {}
-    with tarfile.open(path, mode) as tar:
-        for member in tar:
-            wanted = is_image_name(member.name) or member.name.rpartition("/")[2] in _NOTES
-            if member.isreg() and wanted:
-                content = None if mode == "r:" else tar.extractfile(member)
-                data = None if content is None else content.read()
-                found[member.name] = ImageFile(
-                    member.name, path, member.offset_data, member.size, data
-                )
-    return list(found.values())
 
 
 def open_image_list(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
@@ -493,7 +481,7 @@ def natural_key(name: str) -> tuple[list[float | str], str]:
         ['1700000000.25.jpg', '1700000000.5.jpg', 'map.jpg']
     """
     parts = re.split(r"(\d{9,10}\.\d+|\d+)", name)
-    numbers = [float(part) if "." in part else int(part) for part in parts[1::2]]
+    numbers = [float(part) if "." in part or len(part) > 300 else int(part) for part in parts[1::2]]
     key: list[float | str] = [part.lower() for part in parts]
     key[1::2] = numbers
     return key, name
@@ -506,9 +494,12 @@ def read_text(path: Path) -> str:
         SourceError: If it cannot be read, or is not UTF-8.
     """
     try:
-        return to_text(path.read_bytes(), str(path))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
+        return read_table(path)
+    except NotReadableError as error:
+        raise SourceError(f"{path}: {error}") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or error
+        raise SourceError(f"{path}: cannot be read ({reason})") from None
 
 
 def to_text(data: bytes, name: str) -> str:

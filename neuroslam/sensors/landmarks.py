@@ -3,12 +3,12 @@
 import ast
 import csv
 import io
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from neuroslam.errors import SourceError
+from neuroslam.limits import parse_toml, read_bounded
 
 Kind = Literal["landmark", "wall", "region"]
 """A point with a number; a line through landmarks; a polygon whose corners are landmarks."""
@@ -16,6 +16,8 @@ Kind = Literal["landmark", "wall", "region"]
 KINDS: tuple[Kind, ...] = ("landmark", "wall", "region")
 MOST_CORNERS = 16
 NAME_BYTES, WORDS_BYTES = 64, 128
+MOST_TABLE_BYTES = 16 * 2**20
+"""Largest table of landmarks: some hundred thousand entries."""
 _LEAST_CORNERS = {"landmark": 0, "wall": 2, "region": 3}
 _COLUMNS = ("kind", "number", "name", "words", "corners")
 _RESERVED = ("landmark_", "view_", "nameless_")
@@ -162,7 +164,7 @@ def read_landmarks(path: str | Path) -> tuple[LandmarkWords, ...]:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; expected a table of landmarks") from None
     except (OSError, ValueError) as error:
@@ -175,7 +177,13 @@ def read_landmarks(path: str | Path) -> tuple[LandmarkWords, ...]:
 
 
 def _from_csv(text: str, path: Path) -> list[LandmarkWords]:
-    rows = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="")
+    try:
+        return _entries(csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey=""), path)
+    except csv.Error as error:
+        raise SourceError(f"{path}: is no CSV table ({error})") from None
+
+
+def _entries(rows: "csv.DictReader[str]", path: Path) -> list[LandmarkWords]:
     columns = [name.strip() for name in rows.fieldnames or ()]
     if "name" not in columns or set(columns) - set(_COLUMNS):
         raise SourceError(
@@ -198,8 +206,8 @@ def _from_csv(text: str, path: Path) -> list[LandmarkWords]:
 
 def _from_toml(text: str, path: Path) -> list[LandmarkWords]:
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        tables = parse_toml(text)
+    except ValueError as error:
         raise SourceError(f"{path}: is not TOML ({error})") from None
     entries = []
     for kind, rows in tables.items():

@@ -3,7 +3,8 @@
 import csv
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from neuroslam.errors import SourceError
@@ -28,8 +29,8 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of images, an image list or motion CSV, an .npz or .npy track, "
-    "a TUM, KITTI or EuRoC folder, a ROS bag, camera:0, world:NAME, arena:NAME, or a camera and "
-    "motion as drive.avi+motion.csv"
+    "a TUM, KITTI or EuRoC folder, a donkeycar tub, a ROS bag, camera:0, world:NAME, arena:NAME, "
+    "or a camera and motion as drive.avi+motion.csv"
 )
 _OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
 _PREFIXES = ("world:", "arena:", "camera:")
@@ -49,6 +50,7 @@ def open_source(
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
     ``rat.npz`` with an arena in it     positions and walls (:mod:`neuroslam.worlds.rodent`)
     TUM, KITTI or EuRoC folder          images and truth (:mod:`neuroslam.sensors.datasets`)
+    tub of donkeycar                    images, times, controls (:mod:`neuroslam.sensors.tub`)
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
     ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)
@@ -187,6 +189,18 @@ def absolute_spec(spec: str) -> str:
     return str(Path(spec).resolve())
 
 
+def is_rendered(spec: str) -> bool:
+    """Return whether a source is computed, so that opening it opens no file and no device.
+
+    Example:
+        >>> is_rendered("world:town?laps=2"), is_rendered("arena:rat.npz"), is_rendered("a.avi")
+        (True, False, False)
+    """
+    if not spec.startswith(("world:", "arena:")) or "+" in spec:
+        return False
+    return not spec.partition("?")[0].lower().endswith(".npz")
+
+
 def seeded_spec(spec: str, seed: int) -> str:
     """Return a name for the same source with a seed; the name of a recording stays.
 
@@ -253,10 +267,16 @@ def _open_folder(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
 def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     """Open a text file: an image list if one of its first lines names an image, else motion."""
     text = read_text(path)
-    for row in csv.reader(text.splitlines()[:10]):
+    for row in _first_rows(text, 10):
         if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz, grey)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
+
+
+def _first_rows(text: str, n: int) -> Iterator[list[str]]:
+    """Yield the first rows of a table, as far as they can be read."""
+    with suppress(csv.Error):  # its reader says what is wrong
+        yield from csv.reader(text[:100_000].splitlines()[:n])
 
 
 def _open_positions(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:

@@ -13,16 +13,20 @@ A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the
 import csv
 import io
 import math
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.geometry import wrap_angles
+from neuroslam.limits import NotReadableError, fits, is_bomb, size_text, too_much
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.times import (
     TimeColumn,
@@ -39,6 +43,7 @@ _MOTION = ("v_m_s", "w_rad_s")
 _TRUTH = ("x_m", "y_m", "theta_rad")
 _MAX_SPEED = 1e6  # m/s, rad/s: only a damaged log has more, and its sums could overflow
 _MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
+_COPIES = 4  # of positions: as they are, as numbers, velocities and poses
 _EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s and x_m,y_m,theta_rad"
 
 
@@ -250,7 +255,7 @@ def parse_table(
         >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "").columns["y_m"]
         array([ 2., nan])
     """
-    header, numbered = _header_and_rows(text)
+    header, numbered = _header_and_rows(text, name)
     if not header:
         raise SourceError(f"{name}: is empty; {expected}, and one line per frame")
     lowered = [field.strip().lstrip("#").strip().lower() for field in header]
@@ -297,7 +302,7 @@ def parse_table(
             if on_bad_row is None:
                 raise
             on_bad_row(str(fault))
-    array = np.array(values, dtype=np.float64).reshape(len(values), -1)
+    array = np.array(values, dtype=np.float64).reshape(len(values), len(values[0]) if values else 0)
     table = dict(zip(wanted, array.T, strict=False)) if len(values) else {
         field: np.zeros(0) for field in wanted
     }  # fmt: skip
@@ -311,10 +316,15 @@ def parse_table(
     return Table(table, rows, notes)
 
 
-def _header_and_rows(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def _header_and_rows(text: str, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the header, and the rows with the number of their line, without comments."""
     reader = csv.reader(io.StringIO(text))
-    lines = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
+    try:
+        lines = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
+    except csv.Error as error:  # a field without end, a NUL
+        raise SourceError(
+            f"{name}: line {reader.line_num} is no line of a CSV table ({error})"
+        ) from None
     comments = [row for _, row in lines if row[0].lstrip().startswith("#")]
     rows = [(number, row) for number, row in lines if not row[0].lstrip().startswith("#")]
     leading = 0
@@ -470,11 +480,18 @@ def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file:
+            _require_room(file, path)
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 return {"pos": loaded}
             return {key: loaded[key] for key in loaded.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except NotReadableError as error:
+        raise SourceError(f"{path}: {error}") from None
+    except (
+        *(ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error, struct.error),
+        *(SyntaxError, TypeError, KeyError, OverflowError, MemoryError),  # of damaged headers
+        *(tokenize.TokenError, NotImplementedError, RuntimeError, RecursionError),
+    ) as error:
         if "pickle" in str(error):  # numpy's message for every unknown format
             with path.open("rb") as file:
                 pickled = file.read(6).startswith(_MAY_HOLD_PICKLES)
@@ -486,6 +503,25 @@ def _load_arrays(path: Path) -> dict[str, np.ndarray]:
         raise SourceError(
             f"{path}: is damaged or incomplete ({_first_line(error)}); expected an .npz or .npy"
         ) from None
+
+
+def _require_room(file: BinaryIO, path: Path) -> None:
+    """Check how much memory the arrays of a file take, by what it states about them.
+
+    Raises:
+        NotReadableError: If they do not fit into the budget, or an archive is made to fill memory.
+    """
+    stated = size = path.stat().st_size
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            stated = sum(member.file_size for member in archive.infolist())
+    file.seek(0)
+    if is_bomb(size, stated):
+        raise NotReadableError(
+            f"its {size_text(size)} become {size_text(stated)}; expected an array of positions"
+        )
+    if not fits(needed := _COPIES * stated):
+        raise NotReadableError(too_much(needed))
 
 
 def _first_line(error: Exception) -> str:

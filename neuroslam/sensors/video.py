@@ -13,9 +13,10 @@ from pathlib import Path
 
 import cv2
 
-from neuroslam.errors import BadFrame, SourceError, counted
+from neuroslam.errors import BadFrame, SourceError, counted, require_utf8
+from neuroslam.sensors.avi import half_pictures
 from neuroslam.sensors.grey import to_grey
-from neuroslam.sensors.images import quiet_opencv, require_shape
+from neuroslam.sensors.images import check_pixels, quiet_opencv, require_shape
 from neuroslam.sensors.mp4 import read_mp4
 from neuroslam.sensors.source import OnBadFrame, Source
 from neuroslam.sensors.tracks import time_text
@@ -29,6 +30,9 @@ VIDEO_SUFFIXES = (
 # These containers store their number of frames, and so do those of read_mp4. For the others the
 # decoder estimates it from the duration and the frame rate: the true number may differ.
 _COUNTED = (".avi",)
+_RETRIES = 256
+"""Pictures in succession that cannot be decoded, beyond which a video is at its end."""
+
 _ROUNDING_S = 1e-6
 """A presentation time this near to a multiple of the frame period is that multiple."""
 
@@ -49,14 +53,23 @@ class VideoSource(Source):
         self.grey: GreyRule = grey
         self.path = Path(path)
         self.name = str(path)
+        require_utf8(path, SourceError)
         with self._capture() as capture:
+            width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+            height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+            try:
+                check_pixels(height, width)
+            except BadFrame as error:
+                raise SourceError(f"{self.name}: {error}") from None
             fps = capture.get(cv2.CAP_PROP_FPS)
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             with quiet_opencv():
-                success, image = capture.read()
+                success, image = _grab(capture) is not None, None
+                if success:
+                    success, image = capture.retrieve()
                 first_s = _presented_s(capture)
                 self._has_times = capture.grab() and _presented_s(capture) > first_s
-        if not success:
+        if not success or image is None:
             raise SourceError(
                 f"{self.name}: no frame can be decoded; expected a complete video file"
             )
@@ -75,18 +88,33 @@ class VideoSource(Source):
     ) -> Iterator[Frame]:
         """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`.
 
-        Frames before ``start`` are decoded and dropped, as seeking is not exact. A video with fewer
+        Frames before ``start`` are decoded and dropped, as seeking is not exact. A damaged picture,
+        or half of one in a Motion-JPEG AVI, is a bad frame. A video with fewer
         frames than its container states ends with one bad frame.
         """
         with self._capture() as capture:
             index, latest_s = 0, -math.inf
+            half = half_pictures(self.path)
             while stop is None or index < stop:
-                with quiet_opencv():
-                    success = capture.grab()
-                if not success:
+                lost = _grab(capture)
+                if lost is None:
+                    break
+                for _ in range(lost):
+                    next(half, False)
+                    if index >= start and (stop is None or index < stop):
+                        fault = BadFrame(
+                            f"{self.name}: frame {index} is damaged, it cannot be decoded"
+                        )
+                        if on_bad_frame is None:
+                            raise fault
+                        on_bad_frame(fault)
+                    index += 1
+                if stop is not None and index >= stop:
                     break
                 time_s = self._time_s(capture, index, latest_s)
                 try:
+                    if next(half, False):
+                        raise BadFrame(f"{self.name}: frame {index} is cut short")
                     if not time_s > latest_s:
                         raise BadFrame(
                             f"{self.name}: frame {index}: its time {time_text(time_s)} is not "
@@ -149,13 +177,28 @@ class VideoSource(Source):
         # FFmpeg only, if available: OpenCV's other readers print their errors.
         ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
         with quiet_opencv(), _quiet_ffmpeg():
-            capture = cv2.VideoCapture(self.name, cv2.CAP_FFMPEG if ffmpeg else cv2.CAP_ANY)
+            # The whole path: what stands before a colon would be taken for a protocol.
+            name = str(self.path.resolve())
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG if ffmpeg else cv2.CAP_ANY)
         try:
             if not capture.isOpened():
                 raise SourceError(f"{self.name}: cannot be read; expected a complete video file")
             yield capture
         finally:
             capture.release()
+
+
+def _grab(capture: cv2.VideoCapture) -> int | None:
+    """Grab the next picture that can be decoded.
+
+    Returns:
+        Number of damaged pictures before it; ``None`` at the end of the video.
+    """
+    with quiet_opencv():
+        for lost in range(_RETRIES):
+            if capture.grab():
+                return lost
+    return None
 
 
 def _presented_s(capture: cv2.VideoCapture) -> float:

@@ -179,7 +179,10 @@ what is in 0,0,4,2; where is DOOR; which landmarks are blue; the whole map
 
 
 def ask(
-    semantic_map: SemanticCells | SSPSLAM, question: str | Question, within_m: float | None = None
+    semantic_map: SemanticCells | SSPSLAM,
+    question: str | Question,
+    within_m: float | None = None,
+    unit: str = "m",
 ) -> Answer:
     """Answer a question from the memory of a semantic map.
 
@@ -193,6 +196,7 @@ def ask(
         question: See :func:`parse_question`.
         within_m: Distance up to which something is at a position; ``None``: ``same_m`` of the
             cells, or one length scale of the map.
+        unit: Of lengths on the map; ``arbitrary unit`` for one camera alone.
 
     Raises:
         SpaceError: If the question cannot be read, or a name or word is not known to the map.
@@ -223,7 +227,7 @@ def ask(
     note = ""
     match asked.form:
         case "at":
-            found, note = _at(everything, asked.numbers, within_m)
+            found, note = _at(everything, asked.numbers, within_m, unit)
         case "box":
             found = _in_box(everything, asked.numbers)
             note = "" if found else "nothing is in the box"
@@ -312,7 +316,7 @@ def _confirmed(cells: SemanticCells) -> list[int]:
 
 
 def _at(
-    everything: Sequence[Found], at: Sequence[float], within_m: float
+    everything: Sequence[Found], at: Sequence[float], within_m: float, unit: str
 ) -> tuple[list[Found], str]:
     here = np.array(at)
     apart = [
@@ -327,11 +331,12 @@ def _at(
     found = [one for one in apart if one.distance_m <= within_m]
     if found:  # landmarks first: those at the corners of a region are more than the region
         return sorted(found, key=lambda one: KINDS.index(one.kind)), ""
-    note = f"nothing is within {within_m:g} m of {at[0]:g},{at[1]:g}"
+    note = f"nothing is within {within_m:g} {unit} of {at[0]:g},{at[1]:g}"
     if apart:
         x, y = apart[0].position_m
         note += (
-            f"; the nearest is {apart[0].name} at {x:.2f},{y:.2f}, {apart[0].distance_m:.2f} m away"
+            f"; the nearest is {apart[0].name} at {x:.2f},{y:.2f}, "
+            f"{apart[0].distance_m:.2f} {unit} away"
         )
     return [], note
 

@@ -16,6 +16,7 @@ from neuroslam.spiking.vector_steps import (
     SpaceTables,
     fourier_tables,
 )
+from neuroslam.threads import in_own_types
 
 _STEP_RAD = 1.25  # phase of the shortest wave between two points of the coarse search
 _MOST_POINTS = 20_000
@@ -66,6 +67,7 @@ class PositionDecoder:
         self._waves: Tensor | None = None
         self._tables: tuple[Tensor, Tensor, tuple[object, ...], SpaceTables] | None = None
 
+    @in_own_types
     def __call__(self, z: Tensor) -> Decoded:
         """Decode Fourier coefficients, complex, ``(..., n_frequencies)``.
 
@@ -90,10 +92,12 @@ class PositionDecoder:
         at = at.gather(1, first.unsqueeze(-1).expand(-1, -1, at.shape[-1])).squeeze(1)
         return Decoded(at.reshape(*lead, -1), similarity.gather(1, first).squeeze(1).reshape(lead))
 
+    @in_own_types
     def similarity(self, z: Tensor, x: Tensor) -> Tensor:
         """Return s(x) of positions, ``(..., dimension)``, for coefficients ``(..., K)``."""
         return agreement(self.space, z, x)[0].mean(-1)
 
+    @in_own_types
     def track(self, z: Tensor, start_m: Tensor) -> Tensor:
         r"""Go from positions to the maxima next to them, by one step of Newton's method.
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from neuroslam.config.semantic import SSPSpaceConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking import frequencies as waves
+from neuroslam.threads import in_own_types
 
 
 class SSPSpace(nn.Module):
@@ -173,6 +174,7 @@ class SSPSpace(nn.Module):
         """Of the waves, rad/m, ``(n_frequencies, dimension)``."""
         return self.frequencies / self.length_scale_m
 
+    @in_own_types
     def encode_fourier(self, x: Tensor) -> Tensor:
         """Return Fourier coefficients, complex: ``(..., dimension)`` to ``(..., K)``."""
         angle = self._checked(x) @ self.wave_vectors.T
@@ -195,6 +197,7 @@ class SSPSpace(nn.Module):
             )
         return torch.fft.rfft(phi)[..., 1:]
 
+    @in_own_types
     def gradient(self, x: Tensor) -> Tensor:
         r"""Return :math:`\partial\phi/\partial x = F^{-1}\{i A/\ell \odot F\{\phi\}\}` (Eq. 16).
 
@@ -208,6 +211,7 @@ class SSPSpace(nn.Module):
         whole = torch.cat([torch.zeros_like(slope[..., :1, :]), slope], dim=-2)
         return torch.fft.irfft(whole, n=self.n_features, dim=-2)
 
+    @in_own_types
     def region_fourier(self, low_m: Tensor, high_m: Tensor) -> Tensor:
         r"""Return the mean of a box's points, as Fourier coefficients.
 
@@ -229,6 +233,7 @@ class SSPSpace(nn.Module):
         phi = self.from_fourier(self.region_fourier(low_m, high_m))
         return phi / phi.norm(dim=-1, keepdim=True)
 
+    @in_own_types
     def kernel(self, offset_m: Tensor) -> Tensor:
         r"""Return the similarity of two positions by their displacement.
 
@@ -238,6 +243,7 @@ class SSPSpace(nn.Module):
         waves_there = (self._checked(offset_m) @ self.wave_vectors.T).cos().sum(-1)
         return (1.0 + 2.0 * waves_there) / self.n_features
 
+    @in_own_types
     def similarity(self, phi: Tensor, x: Tensor) -> Tensor:
         """Return how alike vectors and positions are: ``(..., n_features)``, ``(n, dimension)``.
 

@@ -25,7 +25,7 @@ RUN_FIGURES = (
     "views", "experiences", "links", "loop_closures", "merges", "merge_reports", "refused_merges",
     "not_joined", "frames_on_no_joined_map", "skipped_frames", "skipped", "unused", "notes",
     "measured_motion", "warnings", "pictures", "tables", "interrupted",
-    "ate_rmse_m", "odometry_ate_rmse_m",
+    "ate_rmse_m", "odometry_ate_rmse_m", "ate_similarity_rmse_m", "frames_with_truth",
 )  # fmt: skip
 """Figures that every run has: a population's counts must be called otherwise."""
 

@@ -14,7 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, uint8
 
-from neuroslam.errors import CheckpointError, first_line
+from neuroslam.errors import CheckpointError, first_line, require_utf8
+from neuroslam.limits import fits, parse_json, too_much
 
 _KEY = "neuroslam"  # one metadata key: safetensors does not keep the order of several
 
@@ -136,6 +137,9 @@ def load_checked(
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"{path}: no such {kind} file")
+    require_utf8(path, CheckpointError)
+    if not fits(needed := 3 * path.stat().st_size):  # mapped, copied, and the brain's own
+        raise CheckpointError(f"{path}: {too_much(needed)}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -147,7 +151,7 @@ def load_checked(
             "restore it from a copy"
         ) from None
     try:
-        about: dict[str, Any] = json.loads(metadata[_KEY])
+        about: dict[str, Any] = parse_json(metadata[_KEY])
         version, digest = about["format"], about["sha256"]
         if type(version) is not int:
             raise TypeError(version)

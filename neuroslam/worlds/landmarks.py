@@ -1,6 +1,5 @@
 """Worlds of landmarks: named points and walls that are visible from nearby."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuroslam.errors import SourceError
+from neuroslam.limits import MOST_JSON_BYTES, parse_json, read_bounded
 
 COLOURS = ("RED", "BLUE", "GREEN", "ORANGE", "PURPLE")
 SHAPES = ("SQUARE", "TRIANGLE", "CIRCLE", "STAR", "DIAMOND")
@@ -251,7 +251,7 @@ def read_world(path: str | Path) -> LandmarkWorld:
     """
     path = Path(path)
     try:
-        world = json.loads(path.read_text(encoding="utf-8"))
+        world = parse_json(read_bounded(path, MOST_JSON_BYTES))
         landmarks = [
             wall(entry["name"], *entry["boxes_m"], pointer=entry.get("pointer"))
             if "boxes_m" in entry

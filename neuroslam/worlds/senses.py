@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from neuroslam.config.bounds import LARGEST_SEED
 from neuroslam.errors import BadFrame, ConfigError, SourceError, counted
 from neuroslam.geometry import wrap_angles
 from neuroslam.sensors.options import parse_options
@@ -264,7 +265,9 @@ class ArenaOptions(BaseModel):
         le=100,
         description="factor on the noise of self-motion; 0: no noise at all",
     )
-    seed: int = Field(default=0, ge=0, description="seed of the noise, and of a simulated walk")
+    seed: int = Field(
+        default=0, ge=0, le=LARGEST_SEED, description="seed of the noise, and of a simulated walk"
+    )
     rate: float | None = Field(
         default=None, gt=0, le=1000, description="samples per second; none: 20, or as recorded"
     )

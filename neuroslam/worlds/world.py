@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from neuroslam.config.bounds import LARGEST_SEED
 from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI, compose, wrap_angles
 from neuroslam.sensors.options import parse_options
@@ -89,11 +90,11 @@ class WorldOptions(BaseModel):
         default=None, gt=0, le=10_000, description="laps; none: the world's default"
     )
     start: float = Field(default=0.0, ge=0, lt=1, description="start as a fraction of a lap")
-    route: int = Field(default=1, ge=1, description="number of the world's route")
+    route: int = Field(default=1, ge=1, le=100, description="number of the world's route")
     frames_per_lap: int | None = Field(
         default=None, ge=8, le=1_000_000, description="frames in one lap; sets the speed"
     )
-    rate: float = Field(default=10.0, gt=0, description="frames per second")
+    rate: float = Field(default=10.0, gt=0, le=10_000, description="frames per second")
     width: int | None = Field(
         default=None, ge=8, le=4096, description="columns; none: 160, panoramic 256"
     )
@@ -107,8 +108,13 @@ class WorldOptions(BaseModel):
         default=None, description="panoramic camera; none: the world's default"
     )
     grey: bool = Field(default=False, description="one channel, luma, instead of RGB")
-    look: int = Field(default=0, ge=0, description="seed of the textures")
-    seed: int = Field(default=0, ge=0, description="seed of odometry noise, light and pedestrians")
+    look: int = Field(default=0, ge=0, le=LARGEST_SEED, description="seed of the textures")
+    seed: int = Field(
+        default=0,
+        ge=0,
+        le=LARGEST_SEED,
+        description="seed of odometry noise, light and pedestrians",
+    )
     noise: float = Field(
         default=0.0, ge=0, le=1, description="level of odometry noise, for all terms"
     )

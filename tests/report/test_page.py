@@ -45,7 +45,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     run(WORLD, folder / "first", stop=100, tensorboard=False)
     run(WORLD, folder / "second", maps=[folder / "first"], start=40, tensorboard=False)
-    write_report(folder / "second")
+    write_report(folder / "second", source=True)
     return folder
 
 
@@ -359,7 +359,7 @@ def streets(out: Path, n_places: int) -> None:
 
 def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):
     streets(tmp_path / "out", 5000)
-    page = show(write_report(tmp_path / "out"))
+    page = show(write_report(tmp_path / "out", source=True))
     assert page.evaluate("known.places") == 5000
     painted = page.evaluate(
         """async () => {
@@ -382,7 +382,7 @@ def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):
 def test_populations_show_their_counts_and_their_pictures_as_they_are(show, tmp_path):
     config = BrainConfig(cells="pose+head_direction+speed")
     run(WORLD, tmp_path / "run", config, stop=30, tensorboard=False)
-    write_report(tmp_path / "run")
+    write_report(tmp_path / "run", source=True)
     page = show(tmp_path / "run" / "report.html")
     cards = page.locator("#population-list .card")
     assert cards.locator("h3").all_inner_texts() == ["head direction", "speed"]

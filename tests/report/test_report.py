@@ -18,11 +18,12 @@ import pytest
 
 from neuroslam import BrainConfig, load_brain
 from neuroslam.cli import main
+from neuroslam.merging.report import MergeReport
 from neuroslam.report import collect, write_report
 from neuroslam.report.collect import chosen_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
-from neuroslam.report.rows import config_rows
+from neuroslam.report.rows import config_rows, metric_rows
 from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 
@@ -91,7 +92,7 @@ def pages(runs, tmp_path_factory):
     """A page of each."""
     folder = tmp_path_factory.mktemp("pages")
     names = ("whole", "b", "merged", "brains", "rat", "blind")
-    return {name: write_report(runs / name, folder / f"{name}.html") for name in names}
+    return {name: write_report(runs / name, folder / f"{name}.html", source=True) for name in names}
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +192,7 @@ def test_pictures_stay_within_their_budget(runs):
 
 
 def test_a_page_without_pictures_is_small(runs, pages, tmp_path):
-    small = write_report(runs / "whole", tmp_path / "small.html", pictures_mb=0)
+    small = write_report(runs / "whole", tmp_path / "small.html", pictures_mb=0, source=True)
     assert small.stat().st_size < min(250_000, pages["whole"].stat().st_size)
     assert "without pictures" in Page(small).about["picture_notes"][0]
 
@@ -203,10 +204,10 @@ def test_where_the_source_is_gone_the_page_says_so(tmp_path, runs):
         coarse = np.random.default_rng(i).integers(0, 255, (6, 8), np.uint8)
         cv2.imwrite(str(folder / f"{i}.png"), cv2.resize(coarse, (64, 48)))
     run(folder, tmp_path / "out", tensorboard=False)
-    before = Page(write_report(tmp_path / "out"))
+    before = Page(write_report(tmp_path / "out", source=True))
     assert len(before.pictures) == 6
     shutil.rmtree(folder)
-    after = Page(write_report(tmp_path / "out"))
+    after = Page(write_report(tmp_path / "out", source=True))
     name = f"{tmp_path.name}/pictures"
     assert after.about["picture_notes"] == [f"No pictures of {name}: it can no longer be opened."]
     assert after.pictures == []
@@ -219,7 +220,7 @@ def test_names_cannot_break_out_of_their_element(tmp_path):
     odd = folder / "script><img src=x onerror=alert(1)>&quot;{{about}}\u2028'.csv"
     odd.write_text("time_s,v_m_s,w_rad_s\n0.0,0.5,0.0\n0.1,0.5,0.0\n")
     run(odd, tmp_path / "out", tensorboard=False)
-    page = Page(write_report(tmp_path / "out"))
+    page = Page(write_report(tmp_path / "out", source=True))
     assert page.about["name"].startswith("x</script><img")
     assert page.source.count("</script>") == 4
     assert not [tag for tag, _ in page.elements if tag == "img"]
@@ -269,7 +270,7 @@ def test_a_merged_map_has_both_sessions_their_pictures_and_the_report(runs, page
 def test_frames_before_a_merge_are_at_places_as_they_are_named_now(runs, tmp_path):
     out = tmp_path / "second"
     run(WORLD, out, maps=[runs / "a"], start=40, tensorboard=False)
-    page = Page(write_report(out, pictures_mb=0))
+    page = Page(write_report(out, pictures_mb=0, source=True))
     (report,) = page.about["merges"]
     rows, frames = page.arrays, table(out / "frames.csv")
     before = rows["row_frame"] < report["frame"]
@@ -296,7 +297,7 @@ def test_places_of_a_map_whose_run_is_gone_have_no_pictures(runs, tmp_path):
     out = tmp_path / "out"
     arguments = ["merge", tmp_path / "old.safetensors", runs / "b", "-o", out]
     assert main([str(argument) for argument in arguments]) == 0
-    page = Page(write_report(out))
+    page = Page(write_report(out, source=True))
     own = page.arrays["place_session"] == 1
     assert ((page.arrays["place_picture"] >= 0) == own).all()
     assert page.about["picture_notes"] == [
@@ -337,7 +338,7 @@ def test_frames_on_a_map_that_was_not_joined_are_nowhere(tmp_path):
             cv2.imwrite(str(folder / f"{n:03d}.png"), frame.image[..., ::-1])
             n += 1
     run(folder, tmp_path / "out", tensorboard=False)
-    page = Page(write_report(tmp_path / "out", pictures_mb=0))
+    page = Page(write_report(tmp_path / "out", pictures_mb=0, source=True))
     nowhere = np.isnan(page.arrays["row_x_m"])
     assert nowhere[:40].all()
     assert not nowhere[40:].any()
@@ -359,9 +360,9 @@ def test_when_an_animal_was_lost_follows_from_its_doubt():
 def test_a_run_that_was_cut_and_resumed_makes_the_page_of_an_uncut_one(runs, pages, tmp_path):
     out = tmp_path / "cut"
     run(WORLD, out, stop=50)
-    assert len(Page(write_report(out)).arrays["row_frame"]) == 50
+    assert len(Page(write_report(out, source=True)).arrays["row_frame"]) == 50
     resume(out)
-    one, other = Page(write_report(out)), Page(pages["whole"])
+    one, other = Page(write_report(out, source=True)), Page(pages["whole"])
     for name, array in other.arrays.items():
         if not name.startswith("largest_correction"):
             np.testing.assert_array_equal(one.arrays[name], array, err_msg=name)
@@ -373,18 +374,20 @@ def test_rows_after_the_last_save_are_left_out(runs, tmp_path):
     with (out / "frames.csv").open("a") as file:
         file.write((out / "frames.csv").read_text().splitlines()[-1] + "\n70,7.0,0.")
     (out / "trace.f64").write_bytes((out / "trace.f64").read_bytes() + bytes(100))
-    assert len(Page(write_report(out, pictures_mb=0)).arrays["row_frame"]) == 70
+    assert len(Page(write_report(out, pictures_mb=0, source=True)).arrays["row_frame"]) == 70
 
 
 def test_a_page_is_made_alike_every_time(runs, tmp_path):
-    one, other = (write_report(runs / "rat", tmp_path / name) for name in ("1.html", "2.html"))
+    one, other = (
+        write_report(runs / "rat", tmp_path / name, source=True) for name in ("1.html", "2.html")
+    )
     assert one.read_bytes() == other.read_bytes()
 
 
 def test_a_report_leaves_the_run_as_it_was(runs, tmp_path):
     out = shutil.copytree(runs / "whole", tmp_path / "out")
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    assert write_report(out) == out / "report.html"
+    assert write_report(out, source=True) == out / "report.html"
     assert {p: p.read_bytes() for p in before} == before
     assert set(out.rglob("*")) - set(before) - {p for p in out.rglob("*") if p.is_dir()} == {
         out / "report.html"
@@ -484,3 +487,21 @@ def test_ctrl_c_while_a_page_is_made_leaves_the_old_one(runs, tmp_path):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 130, done.stderr
     assert (out / "report.html").read_text() == "old"
+
+
+def test_lengths_of_one_camera_alone_are_in_an_arbitrary_unit_everywhere(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for k in range(6):
+        coarse = np.random.default_rng(k).integers(0, 255, (6, 8), np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), cv2.resize(coarse, (64, 48)))
+    run(folder, tmp_path / "out", tensorboard=False)
+    page = Page(write_report(tmp_path / "out"))
+    assert page.about["unit"] == "arbitrary unit"
+    assert not any(unit == "m" for _, _, unit in page.about["metrics"])
+    report = MergeReport(True, "x", rotation_rad=0.0, translation_m=[1.0, 2.0])
+    assert report.lines("arbitrary unit")[-1].endswith("moved by 1.00, 2.00 arbitrary unit")
+    assert report.lines()[-1].endswith("moved by 1.00, 2.00 m")
+    assert metric_rows({"ate_rmse_m": 0.2}, "arbitrary unit") == [
+        ["ate rmse", 0.2, "arbitrary unit"]
+    ]

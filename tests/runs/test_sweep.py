@@ -1,5 +1,6 @@
 """`neuroslam sweep`: all with all, the same figures however many run at once, and one table."""
 
+import contextlib
 import csv
 import importlib.util
 import json
@@ -179,6 +180,22 @@ def test_two_at_once_give_the_files_of_one_after_the_other(serial, tmp_path, cal
     assert all_but_timings(tmp_path / "two") == all_but_timings(serial[0])
 
 
+def addresses_of(pid):
+    """Return the addresses on which a process and those that it started listen."""
+    try:
+        import psutil
+    except ImportError:
+        return set()
+    found = set()
+    with contextlib.suppress(psutil.Error):
+        for process in (psutil.Process(pid), *psutil.Process(pid).children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                found |= {
+                    c.laddr.ip for c in process.net_connections("inet") if c.status == "LISTEN"
+                }
+    return found
+
+
 @pytest.mark.skipif(
     importlib.util.find_spec("ray") is None, reason="Ray is not installed: neuroslam[sweep]"
 )
@@ -186,11 +203,17 @@ def test_a_local_ray_of_two_workers_gives_the_files_of_one_after_the_other(seria
     out = tmp_path / "ray"
     command = [sys.executable, "-m", "neuroslam.cli", *ARGUMENTS, "-o", str(out)]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    done = subprocess.run(
+    with subprocess.Popen(
         [*command, "--ray", "local", "--jobs", "2"],
-        capture_output=True, text=True, check=False, env=environment,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment,
+    ) as running:  # fmt: skip
+        listening = set()
+        while running.poll() is None:
+            listening |= addresses_of(running.pid)
+            time.sleep(0.2)
+        assert (running.returncode, running.stderr.read()) == (0, "")
+    if listening:  # psutil is installed
+        assert listening <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
     assert digests(out) == digests(serial[0])
     assert all_but_timings(out) == all_but_timings(serial[0])
 
@@ -290,3 +313,14 @@ def test_names_stand_side_by_side_and_what_else_is_varied_is_in_the_legend():
 def test_a_sweep_in_which_all_failed_has_no_figure():
     with pytest.raises(ValueError, match="got 1 rows, expected one of a run that succeeded"):
         plot_sweep([row(error="no such file")], ["source"])
+
+
+def test_a_sweep_prints_the_notes_of_the_readers_once_and_truth_where_it_is_partial(tmp_path, call):
+    motion = "v_m_s,w_rad_s,x_m,y_m,theta_rad\n"
+    (tmp_path / "a.csv").write_text(motion + "1,0.1,0,0,0\n" * 3 + "1,0.1,,,\n" * 3)
+    (tmp_path / "b.csv").write_text(motion + "1,0.1,0,0,0\n" * 6)
+    done = call("sweep", tmp_path / "a.csv", "--seeds", "2", "-o", tmp_path / "o",
+                "--set", "cells=place")  # fmt: skip
+    assert done.out.count("a.csv: has no times; 20 frames per second assumed") == 1
+    done = call("sweep", WORLD, "--seeds", "2", "--stop", "8", "-o", tmp_path / "w")
+    assert "frames with truth" not in " ".join(done.out.split())

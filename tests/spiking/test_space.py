@@ -196,3 +196,18 @@ def test_what_does_not_fit_is_refused_in_one_line(call, said):
 
 def test_similarity_of_nothing_is_zero():
     assert float(similarity(torch.zeros(5), torch.ones(5))) == 0.0
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_space_computes_in_its_own_types_under_autocast(dtype):
+    space = SSPSpace.hexagonal()
+    x = torch.rand(3, 2, generator=torch.Generator().manual_seed(0))
+    plain = space.encode(x), space.gradient(x), space.kernel(x), space.region(x, x + 0.1)
+    decode = PositionDecoder(space)
+    found = decode(space.encode_fourier(x)).position_m
+    with torch.autocast("cpu", dtype=dtype):
+        again = space.encode(x), space.gradient(x), space.kernel(x), space.region(x, x + 0.1)
+        assert torch.equal(decode(space.encode_fourier(x)).position_m, found)
+    for one, other in zip(plain, again, strict=True):
+        assert torch.equal(one, other)
+        assert other.dtype == torch.float32

@@ -427,7 +427,7 @@ def test_processes_of_a_sweep_load_the_file_and_its_seed_is_varied_too(plugin, t
 WORKER = """
 import sys
 from neuroslam.runs.parallel import _attempt_on_ray
-print(_attempt_on_ray(sys.argv[1], bytes.fromhex(sys.argv[2])))
+print(_attempt_on_ray({"NEUROSLAM_PLUGINS": sys.argv[1]}, bytes.fromhex(sys.argv[2])))
 """
 
 
