@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuroslam.cli import main
-from neuroslam.interrupts import raising_interrupts
+from neuroslam.interrupts import handling
 from neuroslam.threads import limit_threads
 
 SEED = 18
@@ -293,54 +293,58 @@ def spoken(done: Done, codes: Sequence[int]) -> str:
 
 def kills(base: Path, tally: Tally, n: int, rng: np.random.Generator) -> None:
     """Kill every command before chosen changes, and look at what is left."""
-    share = -(-n // len(COMMANDS))
-    for name, command in COMMANDS.items():
-        with copies(base, command) as folder:
-            whole = call(*command.arguments, folder=folder)
-            assert whole.code == 0, (name, whole)
-        at = rng.choice(whole.changes, min(share, whole.changes), replace=False) + 1
-        for kill_at in sorted(at.tolist()):
+    changes: dict[str, int] = {}
+    for k in rng.permutation(-(-n // len(COMMANDS)) * len(COMMANDS)).tolist():
+        name = list(COMMANDS)[k % len(COMMANDS)]
+        command = COMMANDS[name]
+        if name not in changes:
             with copies(base, command) as folder:
+                whole = call(*command.arguments, folder=folder)
+                assert whole.code == 0, (name, whole)
+            changes[name] = whole.changes
+        kill_at = int(rng.integers(changes[name])) + 1
+        with copies(base, command) as folder:
+            out = folder / command.out
+            before = contents(out) if command.earlier else {}
+            done = call(*command.arguments, folder=folder, kill_at=kill_at)
+            if command.reads:
+                before.pop("map.png")
+            found = outcome(out, before)
+            if command.reads and found != "old":
+                found = f"LOST: {found}"
+            if done.code not in (0, -signal.SIGKILL):
+                found = spoken(done, (0,)) or found
+            elif not found.startswith("LOST"):
+                over = ["--overwrite"] if "-o" in command.arguments else []
+                again = [*command.arguments, *over]
+                if command.arguments[0] == "resume":
+                    again[again.index("--stop") + 1] = "260"
+                found = spoken(call(*again, folder=folder), (0,)) or found
+                if call("verify", run_folders(out)[0], folder=folder).code:
+                    found = "LOST: not sound after the command was repeated"
+            tally.note(f"SIGKILL in `{name}`", found, kill_at)
+
+
+def full_disks(base: Path, tally: Tally, n: int, rng: np.random.Generator) -> None:
+    """Run every command on disks of growing size, from none to what it needs."""
+    for k in rng.permutation(n * len(COMMANDS)).tolist():
+        name = list(COMMANDS)[k % len(COMMANDS)]
+        command = COMMANDS[name]
+        size = 4096 * (1 + (k // len(COMMANDS)) ** 2 // 2)  # 4 kB to 0.7 MB
+        try:
+            with copies(base, command, size) as folder:
                 out = folder / command.out
                 before = contents(out) if command.earlier else {}
-                done = call(*command.arguments, folder=folder, kill_at=kill_at)
-                if command.reads:
-                    before.pop("map.png")
-                found = outcome(out, before)
-                if command.reads and found != "old":
-                    found = f"LOST: {found}"
-                if done.code not in (0, -signal.SIGKILL):
-                    found = spoken(done, (0,)) or found
-                elif not found.startswith("LOST"):
-                    over = {"-o"} <= set(command.arguments) and "--overwrite"
-                    again = [*command.arguments, *([over] if over else [])]
-                    if command.arguments[0] == "resume":
-                        again[again.index("--stop") + 1] = "260"
-                    found = spoken(call(*again, folder=folder), (0,)) or found
-                    if call("verify", run_folders(out)[0], folder=folder).code:
-                        found = "LOST: not sound after the command was repeated"
-                tally.note(f"SIGKILL in `{name}`", found, kill_at)
-
-
-def full_disks(base: Path, tally: Tally, n: int) -> None:
-    """Run every command on disks of growing size, from none to what it needs."""
-    for name, command in COMMANDS.items():
-        for k in range(n):
-            size = 4096 * (1 + (k * SIZES // n) ** 2 // 2)  # 4 kB to 0.7 MB
-            try:
-                with copies(base, command, size) as folder:
-                    out = folder / command.out
-                    before = contents(out) if command.earlier else {}
-                    done = call(*command.arguments, folder=folder)
-                    found = spoken(done, (0, 2))
-                    if not found:
-                        if command.reads:
-                            before.pop("map.png", None)
-                        found = _after_full(out, before, done)
-            except subprocess.CalledProcessError:
-                tally.note(f"disk full in `{name}`", "not tried (a tmpfs cannot be mounted)")
-                break
-            tally.note(f"disk full in `{name}`", found, size)
+                done = call(*command.arguments, folder=folder)
+                found = spoken(done, (0, 2))
+                if not found:
+                    if command.reads:
+                        before.pop("map.png", None)
+                    found = _after_full(out, before, done)
+        except subprocess.CalledProcessError:
+            tally.note("disk full", "not tried (a tmpfs cannot be mounted)")
+            return
+        tally.note(f"disk full in `{name}`", found, size)
 
 
 def _after_full(out: Path, before: dict[str, str], done: Done) -> str:
@@ -415,12 +419,25 @@ def prepare(base: Path) -> None:
             assert main(text.split()) == 0, text
 
 
-def campaign(scale: float = 1.0, only: str = "") -> Tally:
-    """Run all parts, or those whose names contain ``only``, with a share of the cases."""
+def _stop(_number: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+_STOPS = (signal.SIGTERM, signal.SIGALRM)
+
+
+def campaign(scale: float = 1.0, only: str = "", seconds: float = 0.0) -> Tally:
+    """Run all parts, or those whose names contain ``only``.
+
+    Args:
+        scale: Share of the cases.
+        only: Part of the names.
+        seconds: Longest time of each part; cases come in random order; 0: no limit.
+    """
     tally, rng = Tally(), np.random.default_rng(SEED)
     parts: dict[str, Callable[[Path], None]] = {
         "kills": lambda base: kills(base, tally, round(scale * KILLS), rng),
-        "disks": lambda base: full_disks(base, tally, round(scale * SIZES)),
+        "disks": lambda base: full_disks(base, tally, round(scale * SIZES), rng),
         "writers": lambda base: two_writers(base, tally, round(scale * WRITERS)),
         "damages": lambda base: damages(base, tally, round(scale * DAMAGES), rng),
     }
@@ -429,8 +446,10 @@ def campaign(scale: float = 1.0, only: str = "") -> Tally:
         for part, go in parts.items():
             if only in part:
                 began = time.monotonic()
-                with contextlib.suppress(KeyboardInterrupt), raising_interrupts():
+                with contextlib.suppress(KeyboardInterrupt), handling(_stop, _STOPS):
+                    signal.setitimer(signal.ITIMER_REAL, seconds)
                     go(Path(name))  # an end before the end shows what there is
+                signal.setitimer(signal.ITIMER_REAL, 0)
                 print(f"{part}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     return tally
 
@@ -439,8 +458,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="share of the cases")
     parser.add_argument("--only", default="", help="kills, disks, writers or damages")
+    parser.add_argument("--seconds", type=float, default=0.0, help="longest time of each part")
     options = parser.parse_args()
-    tally = campaign(options.scale, options.only)
+    tally = campaign(options.scale, options.only, options.seconds)
     print(tally.table())
     for line in tally.failures:
         print(line)

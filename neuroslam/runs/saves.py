@@ -6,6 +6,7 @@ process that is killed while it moves them leaves that to the next command (:fun
 """
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -54,6 +55,9 @@ class Folder:
         """
         staged = self.staged
         new = {path.name for path in staged.iterdir()}
+        for name in new:
+            if (self.out / name).is_dir() and not (staged / name).is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), name)
         (staged / _REMOVED).write_text(json.dumps(sorted(set(remove) - new)), encoding="utf-8")
         _sync(staged)
         staged.rename(self.out / COMMITTED)

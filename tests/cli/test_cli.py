@@ -357,6 +357,7 @@ def bit_flipped(path):
 
 
 def newer(path):
+    (path.parent / "manifest.json").unlink(missing_ok=True)
     about = {"format": 99, "config": {}, "sha256": "0"}
     save_file(load_file(path), path, metadata={"neuroslam": json.dumps(about)})
 

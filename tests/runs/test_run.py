@@ -79,7 +79,12 @@ def cut_copy(cut, tmp_path):
 
 def test_a_run_writes_these_files_and_no_others(whole):
     out, _ = whole
-    assert {path.name for path in out.iterdir()} == {*EQUAL, "metrics.json", "events"}
+    assert {path.name for path in out.iterdir()} == {
+        *EQUAL,
+        "metrics.json",
+        "manifest.json",
+        "events",
+    }
 
 
 def test_the_columns_are_a_contract(whole):
