@@ -93,5 +93,6 @@ def _numbers(records: list[dict[str, Any]], keys: tuple[str, ...]) -> np.ndarray
 
 
 def _number(value: object) -> float:
-    known = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
-    return float(value) if known else np.nan
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18:
+        return float(value)
+    return np.nan
