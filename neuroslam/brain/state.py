@@ -169,7 +169,16 @@ class BrainState(QuickModule):
             check_names(self._populations.values())
 
     def _loaded(self) -> None:
-        """Go on from a whole state."""
+        """Go on from a whole state.
+
+        Raises:
+            ValueError: If it has seen less than no frames.
+        """
+        if self.clock.frames_seen < 0 or self.clock.frame < -1:
+            raise ValueError(
+                f"clock: {self.clock.frames_seen} frames seen, the last is frame "
+                f"{self.clock.frame}; expected 0 or more, and -1 or more"
+            )
         self.half_taken = ""
         self._changed()
 

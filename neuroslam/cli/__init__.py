@@ -1,5 +1,6 @@
 """The command line: each command parses, calls one function of the library, and prints."""
 
+import io
 import os
 import sys
 import threading
@@ -153,15 +154,15 @@ def _out_of_memory(error: BaseException) -> bool:
 @contextmanager
 def _replacing_letters() -> Iterator[None]:
     """Print "?" for letters that the terminal does not have."""
-    before = getattr(sys.stdout, "errors", None)
-    if before != "strict" or not hasattr(sys.stdout, "reconfigure"):
+    out = sys.stdout
+    if not isinstance(out, io.TextIOWrapper) or out.errors != "strict":
         yield
         return
-    sys.stdout.reconfigure(errors="replace")
+    out.reconfigure(errors="replace")
     try:
         yield
     finally:
-        sys.stdout.reconfigure(errors=before)
+        out.reconfigure(errors="strict")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -89,8 +89,10 @@ def _lines(path: Path) -> list[bytes]:
 
 def _numbers(records: list[dict[str, Any]], keys: tuple[str, ...]) -> np.ndarray:
     """Return numbers of the records, ``(n, keys)``; NaN where one is missing or no number."""
-    rows = [[record.get(key) for key in keys] for record in records]
-    return np.array(
-        [[v if type(v) in (int, float) and abs(v) < 1e18 else np.nan for v in row] for row in rows],
-        dtype=np.float64,
-    )
+    return np.array([[_number(record.get(key)) for key in keys] for record in records])
+
+
+def _number(value: object) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18:
+        return float(value)
+    return np.nan

@@ -375,5 +375,23 @@ def test_a_brain_whose_config_asks_for_too_much_is_one_line(key, command, finish
     assert last in done.err
 
 
+@pytest.mark.parametrize(("name", "value"), [("clock.frames_seen", -1), ("clock.frame", -7)])
+def test_a_brain_that_has_seen_less_than_no_frames_is_refused(
+    name, value, finished, tmp_path, call
+):
+    out = shutil.copytree(finished, tmp_path / "o")
+    (out / "manifest.json").unlink(missing_ok=True)
+    file = out / "brain.safetensors"
+    with safe_open(file, framework="pt") as opened:
+        about = json.loads(opened.metadata()["neuroslam"])
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    tensors[name].fill_(value)
+    save_checked(file, {k: v for k, v in about.items() if k != "sha256"}, tensors)
+    for command in ("verify", "inspect", "resume"):
+        done = call(command, out)
+        assert done.code == 2
+        assert "clock" in done.err
+
+
 def test_assignments_still_give_what_they_say():
     assert parse_assignment("view.threshold=0.04") == {"view": {"threshold": 0.04}}
