@@ -15,7 +15,13 @@ from neuroslam.errors import SpaceError
 from neuroslam.experiments.semantic_maps import CELLS, STAGES, Trial, score
 from neuroslam.runs.ask import AskedMap
 from neuroslam.sensors.landmarks import LandmarkWords
-from neuroslam.spiking import SSPSLAM, queries, save_semantic_map
+from neuroslam.spiking import (
+    SSPSLAM,
+    load_semantic_map,
+    merge_semantic_maps,
+    queries,
+    save_semantic_map,
+)
 from neuroslam.spiking.ask import EXAMPLES, ask, contents, parse_question
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.spiking.semantic_joining import merge_landmarks
@@ -279,6 +285,23 @@ def test_a_semantic_map_file_is_asked_too(tmp_path):
     save_semantic_map(slam, tmp_path / "map.safetensors")
     answer = AskedMap(tmp_path / "map.safetensors").ask("where is lamp")
     np.testing.assert_allclose(answer.found[0].position_m, (-0.3, 0.6), atol=1e-3)
+
+
+@pytest.mark.parametrize("config", [{}, {"places": True, "sigma_distance_m": 0.1}])
+def test_the_map_of_a_brain_is_written_to_a_file_of_its_own(tmp_path, config):
+    cells = taught(**config)
+    save_semantic_map(cells.slam, tmp_path / "map.safetensors")
+    again = load_semantic_map(tmp_path / "map.safetensors")
+    answer = ask(again, "where is door")
+    np.testing.assert_allclose(answer.found[0].position_m, (2.0, 0.0), atol=0.05)
+    assert again.names == ("DOOR", "LAMP", "DESK", "landmark_3")
+    state = cells.slam.state_dict()
+    assert all(torch.equal(tensor, state[name]) for name, tensor in again.state_dict().items())
+    on = [slam(torch.tensor([[0.3, 0.0]])).z for slam in (cells.slam, again)]
+    assert torch.equal(*on)
+    merged, report = merge_semantic_maps(again, again)
+    assert report.joined
+    assert merged.names == again.names
 
 
 def test_the_answers_of_a_map_are_right_after_save_resume_and_merge():
