@@ -74,7 +74,8 @@ class NavigationPanels(Panels):
         assert isinstance(population, NavigationCells)
         self._cells = population
         self._seen += 1
-        if frame.ranges is not None or bool(population.boundary.activity > 0.0):
+        scanned = population.sheet is not None and frame.ranges is not None
+        if scanned or bool(population.boundary.activity > 0.0):
             self._felt = frame, population.boundary.rates.numpy(force=True).copy()
         if self._seen % self.every:
             return
