@@ -55,7 +55,8 @@ def plot_sheet(
             if len(walls):
                 at = (np.degrees(walls[:, 1]) + step / 2.0) % 360.0 - step / 2.0
                 axes.plot(at, walls[:, 0], "o", ms=9, mfc="none", mec=LOOP, mew=1.6, clip_on=False)
-            axes.set(xlabel=f"{bearing} (degrees)", xticks=_DEGREES, xlim=(-step / 2.0, 360.0))
+            axes.set(xlabel=f"{bearing} (degrees)", xticks=_DEGREES)
+            axes.set_xlim(-step / 2.0, 360.0 - step / 2.0)
             axes.grid(visible=False)
             write_title(axes, name)
         panels[0].set_ylabel("distance (m)")
