@@ -234,6 +234,23 @@ def test_an_outlier_of_a_later_session_does_not_move_a_landmark_in_a_merge():
     np.testing.assert_allclose(ask(merged, "where is door").found[0].position_m, (2, 0), atol=0.05)
 
 
+def test_one_outlier_of_a_known_landmark_does_not_end_the_learning_of_new_ones():
+    cells = SemanticCells(SemanticConfig())
+    cells.name_landmarks(WORDS)
+    door, lamp = np.array([[0.0, 2.0, 0.0]]), np.array([[1.0, 2.0, math.pi / 2.0]])
+    outlier = np.array([[0.0, 5.0, math.pi]])
+    nothing = np.empty((0, 3))
+    for rows in (*[door] * 20, nothing, door, door, outlier, outlier):
+        cells.advance(STILL, Sightings.of(rows), compass_rad=0.0)
+    assert 0.0 < float(cells.slam.contradicted_s) < cells.config.relocalise_after_s
+    for _ in range(30):
+        cells.advance(STILL, Sightings.of(lamp), compass_rad=0.0)
+    assert float(cells.slam.contradicted_s) == 0.0
+    for name, position_m in (("lamp", (0, 2)), ("door", (2, 0))):
+        found = ask(cells, f"where is {name}").found[0]
+        np.testing.assert_allclose(found.position_m, position_m, atol=0.05)
+
+
 # --- runs --------------------------------------------------------------------------------------
 
 
