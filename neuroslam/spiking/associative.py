@@ -97,7 +97,7 @@ class AssociativeMap(BufferModule):
         tuning = sample_tuning(1, n, n_key, neurons, draw, 1.0, near, config.intercept)
         self.memory = NeuronArray(tuning, neurons, time_step_s, draw, batch)
         self.register_buffer("gain", tuning.gain[0] / tuning.radius)
-        self.register_buffer("encoders", self.memory.weights.expand(batch, -1, -1).contiguous())
+        self.register_buffer("encoders", self.memory.weights.repeat(batch, 1, 1))
         self.register_buffer("decoders", torch.zeros(batch, n, n_value))
         self.register_buffer("activity_hz", torch.zeros(batch, n))
         for name in ("recalled", "relayed", "taught", "rule"):
