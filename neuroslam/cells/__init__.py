@@ -1,6 +1,7 @@
 """Populations of cells whose activity encodes the pose of the animal."""
 
 from neuroslam.cells.boundary import BoundaryCells
+from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.cells.convolve import circular_convolve, gaussian_kernel, ring_convolve
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
@@ -16,6 +17,7 @@ from neuroslam.cells.walls import WallMemory
 
 __all__ = [
     "BoundaryCells",
+    "BoundarySheet",
     "CompetitiveHebbianPlaceCells",
     "Familiarity",
     "GridSheet",

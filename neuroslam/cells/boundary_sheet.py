@@ -326,6 +326,18 @@ class BoundarySheet(nn.Module):
                 out = out + gain * self._multiply(tuned, name, name)
         return out.clamp_min(0.0)
 
+    def interactions(self, tuned: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Return mutual excitation and the inhibition of the surround.
+
+        .. math:: g_E\, G_E * u, \qquad g_I\, G_I * u
+
+        Args:
+            tuned: :math:`u`, ``(..., n_bearings, n_distances)``.
+        """
+        c = self.config
+        excitation = c.sheet_excitation * self._multiply(tuned, "excite", "excite")
+        return excitation, c.sheet_inhibition * self._multiply(tuned, "inhibit", "inhibit")
+
     def _multiply(self, values: Tensor, bearing: str, distance: str) -> Tensor:
         ring = self.get_buffer(f"_{bearing}_matrix_0")
         return ring @ (values @ self.get_buffer(f"_{distance}_matrix_1").mT)
@@ -347,10 +359,14 @@ class BoundarySheet(nn.Module):
         Args:
             ranges: As for :func:`~neuroslam.sensors.scan.walls_in_scan`, ``(n,)``.
         """
+        return self.interact(self.tuned_to_scan(ranges))
+
+    def tuned_to_scan(self, ranges: np.ndarray) -> Tensor:
+        """Return the responses to the beams of a scan before cells interact."""
         sides = torch.from_numpy(self._rasterise(checked_ranges(ranges)))
         scale = math.sqrt(TWO_PI) * self.sigmas[1]
         left, right = self._multiply(sides.to(self.warped_m), "half", "excite").unbind(0)
-        return self.interact(scale * (left * right).clamp_min(0.0).sqrt())
+        return scale * (left * right).clamp_min(0.0).sqrt()
 
     def _rasterise(self, ranges: np.ndarray) -> np.ndarray:
         n, c = len(ranges), self.config

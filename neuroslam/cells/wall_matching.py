@@ -18,7 +18,8 @@ _LEAST_SHARE = 0.6  # of the walls of the smaller map that must match
 _CLEARLY = 0.85  # largest share of those that any other alignment may match
 _BEARING_RAD = math.radians(15.0)
 _OFF_SIGMAS = 2.5  # standard deviations within which two walls match
-_RMS_SIGMAS = 0.85  # largest RMS residual, in standard deviations
+_RMS_SIGMAS = 0.85, 1.2  # largest RMS residual, in sd, up to this share, and where all match
+_MOST = 0.85  # share of the walls that match from which on maps may be bent
 _LEAST_SPREAD = 0.08  # of normals: parallel walls leave the alignment open along them
 _TURNS = 12
 _CANDIDATES = 20_000
@@ -200,9 +201,11 @@ def match_walls(
     )
     if best.n_same < needed:
         return None, f"at most {aligned}; at least {needed} must"
-    if best.off_m > _RMS_SIGMAS * memory.sigma_m:
+    most_m = largest_residual(best.n_same / min(counts), memory.sigma_m)
+    if best.off_m > most_m:
         return None, (
-            f"{aligned}; walls of one place leave at most {_RMS_SIGMAS * memory.sigma_m:.3f} m"
+            f"{aligned}; where so many align, walls of one place leave at most {most_m:.3f} m; "
+            "longer sessions remember their walls more exactly"
         )
     if best.spread < _LEAST_SPREAD:
         return (
@@ -216,6 +219,27 @@ def match_walls(
         return None, f"{aligned}, but no experience of one is near an experience of the other"
     n = len(match.pairs.partial)
     return match, f"{aligned}; {counted(n, 'experience is', 'experiences are')} the same"
+
+
+def largest_residual(share: float, sigma_m: float) -> float:
+    r"""Return the largest RMS residual with which two maps can be of one place, metres.
+
+    .. math:: \sigma\,\Bigl(0.85 + (1.2 - 0.85)\,\frac{[p - 0.85]_+}{1 - 0.85}\Bigr)
+
+    Drift bends the maps of short sessions by some centimetres, but nearly all walls of one place
+    match; those of another that is alike do not.
+
+    Args:
+        share: :math:`p`, walls that match over those of the smaller map; above 1 as 1.
+        sigma_m: :math:`\sigma`, standard deviation of a remembered wall.
+
+    Example:
+        >>> [round(largest_residual(share, 0.02), 4) for share in (0.6, 0.925, 1.2)]
+        [0.017, 0.0205, 0.024]
+    """
+    least, most = _RMS_SIGMAS
+    part = max(min(share, 1.0) - _MOST, 0.0) / (1.0 - _MOST)
+    return sigma_m * (least + (most - least) * part)
 
 
 def outline_of(x: Tensor, y: Tensor, bearing_rad: Tensor, distance_m: Tensor) -> Outline:

@@ -357,7 +357,7 @@ class MapConfig(Section):
     solver: Literal["relax", "least_squares"] = Field(
         default="relax",
         description="how the map is made consistent; relax: iterative relaxation, Eq. 8 of the "
-        "RatSLAM paper; least_squares: sparse pose-graph optimisation",
+        "multisession paper; least_squares: sparse pose-graph optimisation",
     )
     correction: float = Field(
         default=0.5,

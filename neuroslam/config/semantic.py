@@ -133,9 +133,18 @@ class NeuronConfig(Section):
         description="range of projections on the preferred direction above which neurons fire; "
         "larger: sparser activity",
     )
+    weight_bits: int = Field(
+        default=0,
+        ge=0,
+        le=24,
+        description="bits of the neurons' weights, for which decoders are then solved; larger: "
+        "finer; 0: floating point; quantised sets 8",
+    )
 
     @model_validator(mode="after")
     def _rates_can_be_reached(self) -> Self:
+        if self.weight_bits == 1:
+            raise ValueError("weight_bits is 1; expected 0, or 2 to 24: one bit is the sign")
         low, high = self.max_rate_hz
         if not 0 < low <= high or high * self.tau_ref_s >= 1:
             raise ValueError(

@@ -12,6 +12,7 @@ from neuroslam.figures.spikes import Run, plot_dead_reckoning
 from neuroslam.figures.style import save
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.spiking.quantise import quantised
+from neuroslam.spiking.rounding import WEIGHT_BITS
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.worlds.landmark_paths import LandmarkPath, read_kitti
 
@@ -87,7 +88,8 @@ def _reckon(path: LandmarkPath, budget: int, chip: bool) -> tuple[Run, np.ndarra
     config = PathIntegratorConfig(
         neurons=budget // space.n_frequencies, max_speed_m_s=round(1.05 * speed, 2)
     )
-    neurons = NeuronConfig(model="stepped_lif" if chip else "lif")
+    chip_neurons = NeuronConfig(model="stepped_lif", weight_bits=WEIGHT_BITS)
+    neurons = chip_neurons if chip else NeuronConfig()
     integrator = PathIntegrator(space, config, neurons, path.time_step_s)
     if chip:
         integrator = quantised(integrator)

@@ -5,6 +5,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -13,13 +14,19 @@ import numpy as np
 from neuroslam.brain import NavigationBrain
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
-from neuroslam.errors import MapError
+from neuroslam.errors import MapError, counted
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.report.rows import config_rows, metric_rows
-from neuroslam.runs.reading import experiences_of, odometry_track, trajectory, true_poses, unit_of
+from neuroslam.runs.reading import (
+    experiences_of,
+    odometry_track,
+    trajectory,
+    true_poses,
+    unit_of,
+)
 from neuroslam.spiking.ask import contents
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.state.answers import counts_of, pictures_of
@@ -38,7 +45,8 @@ class Facts(NamedTuple):
     Attributes:
         about: Plain values for JSON: names, counts, reports, config.
         arrays: ``row_...`` for each frame, ``place_...`` for each experience, ``link_...``,
-            ``cell_...`` and ``wall_...`` likewise; lengths in m, angles in rad, times in s.
+            ``cell_...`` and ``wall_...`` likewise, ``plan_place`` the experiences of a planned
+            path; lengths in m, angles in rad, times in s.
     """
 
     about: dict[str, Any]
@@ -50,6 +58,11 @@ def collect(run: FinishedRun) -> Facts:
     rows = chosen_rows(run.actions)
     arrays = _rows(run, rows) | _map(run) | _cells(run.brain)
     notes = []
+    planned, note = planned_path(run)
+    if planned:
+        arrays["plan_place"] = np.array(planned, np.int32)
+    if note:
+        notes.append(note)
     if len(rows) < len(run.actions):
         notes.append(
             f"{len(rows):,} of {len(run.actions):,} frames are on this page: every "
@@ -94,6 +107,30 @@ def collect(run: FinishedRun) -> Facts:
             "which this run does not have."
         )
     return Facts(about, arrays)
+
+
+def planned_path(run: FinishedRun) -> tuple[list[int], str]:
+    """Return the experiences of the path in ``plan.csv``, and a line about it; empty for none.
+
+    A path whose links are not on the map was planned on an earlier one, and is left out.
+    """
+    path, links, n = run.planned, run.brain.map.links, run.brain.map.n
+    if not path:
+        return [], ""
+    there = set(zip(links.source.tolist(), links.target.tolist(), strict=True))
+    steps = list(pairwise(path))
+    stale = min(path) < 0 or max(path) >= n
+    if stale or any(step not in there and step[::-1] not in there for step in steps):
+        return [], (
+            "The planned path in plan.csv is of another map, and is not shown; "
+            "run neuroslam plan again."
+        )
+    xy = run.brain.map.poses[path, :2]
+    length_m = float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum())
+    return path, (
+        f"Planned path: from experience {path[0]} to {path[-1]}, {counted(len(steps), 'link')}, "
+        f"{length_m:.1f} {length_unit(run.out / 'brain.safetensors')}."
+    )
 
 
 def chosen_rows(actions: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ const layers = {
   truth: { name: "Truth", on: true },
   walls: { name: "Remembered walls", on: true },
   landmarks: { name: "Landmarks", on: true },
+  plan: { name: "Planned path", on: true },
   merges: { name: "Merge points", on: true },
   ids: { name: "Ids of experiences", on: true },
 };

@@ -36,6 +36,7 @@ function ring(pen, x, y, radius, colour, width) {
 function drawLive(pen, at) {
   const dot = at.dot, px = (i) => at.sx(run.place_x_m[i]), py = (i) => at.sy(run.place_y_m[i]);
   if (layers.ids.on && at.spacing * at.view.scale > 26) drawIds(pen, at, dot);
+  if (layers.plan.on && run.plan_place) drawPlan(pen, at, dot);
   if (layers.merges.on) for (const point of mergePoints()) ring(pen, at.sx(point.x), at.sy(point.y), dot + 6, colours.match, 2);
   if (chosen.link >= 0) {
     const a = run.link_from[chosen.link], b = run.link_to[chosen.link];
@@ -86,6 +87,17 @@ function drawLive(pen, at) {
   if (here >= 0) ring(pen, px(here), py(here), dot + 3, colours.robot, 2);
   const x = run.row_x_m[chosen.row], y = run.row_y_m[chosen.row];
   if (x === x) dart(pen, at.sx(x), at.sy(y), run.row_theta_rad[chosen.row], isLost(chosen.row) ? colours.match : colours.robot);
+}
+
+function drawPlan(pen, at, dot) {  // the path that `neuroslam plan` found, and a ring at its goal
+  const place = Array.from(run.plan_place), xs = place.map((i) => run.place_x_m[i]), ys = place.map((i) => run.place_y_m[i]);
+  pen.lineJoin = pen.lineCap = "round";
+  for (const [colour, width] of [[colours.panel, 7], [colours.plan, 4]]) {
+    pen.strokeStyle = colour;
+    pen.lineWidth = width;
+    line(pen, at, xs, ys);
+  }
+  ring(pen, at.sx(xs.at(-1)), at.sy(ys.at(-1)), dot + 7, colours.plan, 2.5);
 }
 
 function dart(pen, x, y, heading, colour) {

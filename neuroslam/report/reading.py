@@ -15,6 +15,7 @@ from neuroslam.runs.reading import (
     read_frames,
     read_metrics,
     read_plan,
+    read_planned,
     read_trace,
 )
 
@@ -30,7 +31,10 @@ class Curve(NamedTuple):
 
 
 class FinishedRun(NamedTuple):
-    """The files of a run; ``frames`` and ``trace`` have a row per frame, or none after a merge."""
+    """The files of a run; ``frames`` and ``trace`` have a row per frame, or none after a merge.
+
+    ``planned`` are the experiences of the path in ``plan.csv``.
+    """
 
     out: Path
     plan: RunPlan
@@ -40,6 +44,7 @@ class FinishedRun(NamedTuple):
     trace: dict[str, np.ndarray]
     metrics: dict[str, Any]
     curves: dict[str, Curve]
+    planned: list[int]
 
 
 def read_run(out: str | Path) -> FinishedRun:
@@ -70,6 +75,7 @@ def read_run(out: str | Path) -> FinishedRun:
         {name: column[:rows] for name, column in trace.items()},
         read_metrics(out),
         read_curves(out, frames["frame"]),
+        read_planned(out),
     )
 
 

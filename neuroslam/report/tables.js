@@ -136,7 +136,7 @@ function startNotes() {
 }
 
 function startLayers() {
-  const there = { truth: !!run.row_truth_x_m, walls: !about.cells.includes("pose") && !!run.wall_x_m, landmarks: !!run.landmark_x_m && run.landmark_x_m.length > 0, merges: mergePoints().length > 0,
+  const there = { truth: !!run.row_truth_x_m, walls: !about.cells.includes("pose") && !!run.wall_x_m, landmarks: !!run.landmark_x_m && run.landmark_x_m.length > 0, plan: !!run.plan_place, merges: mergePoints().length > 0,
     odometry: known.rows > 0, whole: known.rows > 0, track: known.rows > 0, loops: known.loops.length > 0 };
   for (const [name, layer] of Object.entries(layers)) {
     if (there[name] === false) { layer.on = false; continue; }
@@ -162,6 +162,7 @@ function showLegend() {
   if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
   if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
   if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, scaled by ${(1 / about.truth_scale).toFixed(2)}`);
+  if (layers.plan.on) add("key-line", { borderColor: colours.plan, borderTopWidth: "4px" }, "planned path");
   if (layers.merges.on) add("key-ring", colour(colours.match), "merge points");
   if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "remembered walls");
   if (layers.landmarks.on) add("key-dot", { background: colours.landmark }, "landmarks");

@@ -41,7 +41,7 @@ const SESSIONS = ["map", "second", "third", "fourth", "fifth", "sixth"];
 function readColours() {
   const style = getComputedStyle(document.documentElement);
   for (const name of ["panel", "ink", "soft", "line", "faint", "accent", "loop", "robot", "path",
-    "odometry", "truth", "link", "wall", "landmark", "match", "lost", ...SESSIONS]) {
+    "odometry", "truth", "link", "wall", "landmark", "match", "plan", "lost", ...SESSIONS]) {
     colours[name] = style.getPropertyValue(`--${name}`).trim();
   }
   notify("colours");

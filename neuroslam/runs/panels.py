@@ -1,20 +1,24 @@
 """TensorBoard panels that sample a population over time and draw the samples."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import matplotlib as mpl
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
+from neuroslam.cells.boundary_sheet import unwarp, warped_tuning
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.evaluation.gridness import autocorrelogram, gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
+from neuroslam.figures.activity import plot_bump, plot_sheet
 from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import ACTIVITY, STYLE, new_figure, render
 from neuroslam.runs.semantic_panels import SemanticPanels, known_landmarks
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.state.population import Population
+from neuroslam.types import Frame
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -29,7 +33,7 @@ class Panels(ABC):
     """Panels of one population, beyond its own scalars and images."""
 
     @abstractmethod
-    def note(self, population: Population) -> None:
+    def note(self, population: Population, frame: Frame) -> None:
         """Sample a frame; a brain that joins or starts a map replaces its populations."""
 
     @abstractmethod
@@ -46,7 +50,7 @@ class Panels(ABC):
 
 
 class NavigationPanels(Panels):
-    """Draws rate maps of grid cells, rates of boundary cells and the map of place cells.
+    """Draws rate maps of grid cells, boundary cells, and the map and the bump of place cells.
 
     Positions are those estimated by the brain. When a long run has too many samples, every other
     one is dropped.
@@ -63,12 +67,16 @@ class NavigationPanels(Panels):
         self._positions: list[np.ndarray] = []
         self._rates: list[np.ndarray] = []
         self._boundary: list[float] = []
+        self._felt: tuple[Frame, np.ndarray] | None = None  # the last walls, and the cells' rates
 
-    def note(self, population: Population) -> None:
+    def note(self, population: Population, frame: Frame) -> None:
         """Take a sample if one is due."""
         assert isinstance(population, NavigationCells)
         self._cells = population
         self._seen += 1
+        scanned = population.sheet is not None and frame.ranges is not None
+        if scanned or bool(population.boundary.activity > 0.0):
+            self._felt = frame, population.boundary.rates.numpy(force=True).copy()
         if self._seen % self.every:
             return
         self._positions.append(population.oscillators.position_m.numpy(force=True).copy())
@@ -99,6 +107,10 @@ class NavigationPanels(Panels):
         """Return all figures, and the median grid score of each module, by tag."""
         path = np.array(self._positions).reshape(-1, 2)
         figures = {"cells/place_map": plot_place_cells(*cells.remembered(), cells.pose, path)}
+        if int(cells.place.n_cells):
+            figures["cells/place_bump"] = _draw_bump(cells)
+        if self._felt is not None:
+            figures["cells/boundary_cells"] = _draw_boundary_cells(cells, *self._felt)
         scores: dict[str, float] = {}
         if len(self._positions) >= _LEAST_SAMPLES:
             at = np.array(self._positions)
@@ -156,6 +168,47 @@ class NavigationPanels(Panels):
         return figure
 
 
+def _draw_bump(cells: NavigationCells) -> Figure:
+    position = cells.oscillators.position_m
+    bump, centre = cells.place.bump(cells.grid.rates.flatten(-2), position)
+    centres = cells.place.graph()[0]
+    return plot_bump(*(part.numpy(force=True) for part in (centres, bump, position, centre)))
+
+
+def _draw_boundary_cells(cells: NavigationCells, frame: Frame, rates: np.ndarray) -> Figure:
+    """Draw the sheet, where it senses the walls, else the boundary cells of the paper."""
+    sheet, title = cells.sheet, f"Boundary cells in frame {frame.index}"
+    if sheet is None:
+        axes = cells.boundary.preferred_rad, cells.boundary.preferred_m
+        bearings, distances = (part.numpy(force=True) for part in axes)
+        layers = {"rates": rates}
+        return plot_sheet(layers, bearings, distances, np.empty((0, 2)), title, "bearing in world")
+    with torch.inference_mode():
+        if frame.walls is not None:
+            felt = torch.from_numpy(np.asarray(frame.walls, dtype=np.float64)).reshape(-1, 2)
+            axes = sheet.bearings_rad, sheet.warped_m
+            tuned = warped_tuning(felt[:, 0], felt[:, 1], axes, sheet.config)
+            clear = None
+        else:
+            tuned, clear = sheet.tuned_to_scan(cast(np.ndarray, frame.ranges)), sheet.clear_scan
+        excitation, inhibition = sheet.interactions(tuned)
+        response = sheet.interact(tuned)
+        distance, bearing, _ = sheet.read(response, clear)
+    layers = {
+        "tuned to walls": tuned, "excitation": excitation, "inhibition": inhibition,
+        "response": response,
+    }  # fmt: skip
+    inside = sheet.warped_m >= 0.0
+    return plot_sheet(
+        {name: layer[:, inside].numpy(force=True) for name, layer in layers.items()},
+        sheet.bearings_rad.numpy(force=True),
+        unwarp(sheet.warped_m[inside], sheet.config.beta_m).numpy(force=True),
+        torch.stack([distance, bearing], dim=1).numpy(force=True),
+        title,
+        "bearing from heading",
+    )
+
+
 class LandmarkPanels(Panels):
     """Draws the recall of the semantic map and the spikes of SSP-SLAM.
 
@@ -167,7 +220,7 @@ class LandmarkPanels(Panels):
         self.writer = writer
         self._watched: tuple[SemanticCells, SemanticPanels] | None = None
 
-    def note(self, population: Population) -> None:
+    def note(self, population: Population, frame: Frame) -> None:
         """Watch the steps of SSP-SLAM of this population."""
         assert isinstance(population, SemanticCells)
         if self._watched is not None and self._watched[0] is population:

@@ -1,5 +1,6 @@
 """Readers for the files of a run: rows, plan, figures, and the pose of every frame."""
 
+import csv
 import json
 import math
 from itertools import islice, takewhile
@@ -74,6 +75,24 @@ def read_trace(
     check_saved(path)
     table = values[: (rows or there) * width].reshape(-1, width)
     return {name: table[:, i] for i, name in enumerate(TRACE_COLUMNS)}
+
+
+def read_planned(out: str | Path) -> list[int]:
+    """Read the experiences of ``plan.csv``, which ``plan`` wrote; none if there is no such file.
+
+    Raises:
+        RunError: If it is damaged.
+    """
+    path = Path(out) / "plan.csv"
+    if not path.is_file():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as opened:
+            return [int(row["experience"]) for row in csv.DictReader(opened)]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        raise RunError(
+            f"{path}: damaged; write it again with neuroslam plan, or delete it"
+        ) from None
 
 
 def experiences_of(

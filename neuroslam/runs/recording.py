@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 320  # pixels of a recorded image: a 60x10 template is too small to see
 _MOST_PIXELS = 1600  # of a side of a coloured image: a row of many cells is long
+_FIRST_MAP = 50  # frames until the map is first drawn
 _THUMBNAIL = 48  # pixels of a template's side in the projector, whose sprite must stay small
 
 
@@ -71,8 +72,9 @@ class TensorBoardRecorder(Recorder):
 
     A brain with place cells adds: counts of place cells, activated boundary cells and walls,
     boundary activity, position uncertainty, ``gridness/...`` of each module; and the images
-    ``cells/grid_rate_maps``, ``cells/boundary_response`` and ``cells/place_map``, at growing
-    intervals because their cost grows.
+    ``cells/grid_rate_maps``, ``cells/boundary_response``, ``cells/place_map``,
+    ``cells/boundary_cells`` (with excitation and inhibition, where a sheet senses the walls) and
+    ``cells/place_bump``, at growing intervals because their cost grows.
 
     A brain with a semantic map adds: the count of landmarks, for how long they disagree with the
     estimated pose, and of the last step of SSP-SLAM ``ssp/recall``, ``ssp/agreement``, ``ssp/gate``
@@ -83,7 +85,8 @@ class TensorBoardRecorder(Recorder):
         folder: Folder of the event files; created if missing.
         scalars_every: Frames between two points of a curve.
         images_every: Frames between two images of view and cells.
-        maps_every: Frames between two drawings of the map, the slowest part (0.1 s).
+        maps_every: Frames between two drawings of the map, the slowest part (0.1 s); the first ones
+            are after 50, 100, 200, ... frames.
         projected: Most templates, evenly sampled, for the projector.
 
     Raises:
@@ -110,7 +113,8 @@ class TensorBoardRecorder(Recorder):
         self._seen = 0
         self._measured = False
         self._panels: dict[str, Panels] = {}
-        self._panels_due = 0  # frame
+        self._map_due = min(maps_every, _FIRST_MAP)  # frames seen
+        self._panels_due = 0  # the same
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
         except OSError as error:
@@ -126,7 +130,7 @@ class TensorBoardRecorder(Recorder):
             if kind in PANELS:
                 if kind not in self._panels:
                     self._panels[kind] = PANELS[kind](self._writer)
-                self._panels[kind].note(population)
+                self._panels[kind].note(population, frame)
         if result.frame % self.scalars_every == 0:
             self._write_scalars(result, brain)
         if result.frame % self.images_every == 0:
@@ -137,8 +141,10 @@ class TensorBoardRecorder(Recorder):
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for tag, activity in gathered(brain.populations.values(), pictures_of).items():
                 self._write_picture(tag, coloured(activity), result.frame)
-        if result.frame % self.maps_every == 0 and result.frame > 0:
+        if self._seen > self._map_due:
+            self._map_due += min(self.maps_every, self._map_due)
             self._write_map(result.frame, brain)
+            self._writer.flush()  # to be seen while the run goes on
 
     @contextlib.contextmanager
     def moving_to(self, folder: Path) -> Iterator[None]:
@@ -191,8 +197,8 @@ class TensorBoardRecorder(Recorder):
             unit="m" if self._measured else "arbitrary unit",
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
-        if last or frame >= self._panels_due:
-            self._panels_due = frame + max(self.maps_every, frame // 2)
+        if last or self._seen >= self._panels_due:
+            self._panels_due = self._seen + self._seen // 2
             for panels in self._panels.values():
                 panels.write_figures(frame)
         self._drawn = frame

@@ -9,13 +9,13 @@ from torch import Tensor
 from neuroslam.compiled import runs_compiled
 from neuroslam.config.semantic import PathIntegratorConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import may_share, replace, view
-from neuroslam.spiking.path_integrator import REREAD_STEPS, Packet, coupled
+from neuroslam.spiking.path_integrator import REREAD_STEPS, BasePathIntegrator, coupled
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.spiking.vector_steps import Scratch, Sights, VectorState, advance
 from neuroslam.state.mergeable import BufferModule
 
 
-class AlgebraicIntegrator(Packet):
+class AlgebraicIntegrator(BasePathIntegrator):
     r"""Represents a position by phases that the velocity advances.
 
     .. math:: z_k \leftarrow z_k\, e^{i (a_k \cdot v\,\Delta t + \sigma \sqrt{\Delta t}\,\xi_k)}

@@ -9,7 +9,6 @@ from torch import Tensor
 from neuroslam.config.semantic import NeuronConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
-    Tuning,
     lowpass,
     rates,
     replace,
@@ -98,15 +97,17 @@ class AssociativeMap(BufferModule):
         tuning = sample_tuning(1, n, n_key, neurons, draw, 1.0, near, config.intercept)
         self.memory = NeuronArray(tuning, neurons, time_step_s, draw, batch)
         self.register_buffer("gain", tuning.gain[0] / tuning.radius)
-        self.register_buffer("encoders", tuning.weights.expand(batch, -1, -1).contiguous())
+        self.register_buffer("encoders", self.memory.weights.repeat(batch, 1, 1))
         self.register_buffer("decoders", torch.zeros(batch, n, n_value))
         self.register_buffer("activity_hz", torch.zeros(batch, n))
         for name in ("recalled", "relayed", "taught", "rule"):
             self.register_buffer(name, torch.zeros(batch, n_value))
         for name in ("relay", "error")[not config.relay :]:
             tuning = sample_tuning(1, n, n_value, neurons, draw)
-            setattr(self, name, NeuronArray(tuning, neurons, time_step_s, draw, batch))
-            self.register_buffer(f"{name}_decoders", _identity(tuning, neurons, draw) / time_step_s)
+            part = NeuronArray(tuning, neurons, time_step_s, draw, batch)
+            setattr(self, name, part)
+            decoders = _identity(part, tuning.radius, draw) / time_step_s
+            self.register_buffer(f"{name}_decoders", decoders)
 
     def forward(
         self,
@@ -262,11 +263,10 @@ class AssociativeMap(BufferModule):
         self.decoders = weights.to(self.decoders.dtype).contiguous()
 
 
-def _identity(tuning: Tuning, config: NeuronConfig, draw: torch.Generator) -> Tensor:
+def _identity(neurons: NeuronArray, radius: float, draw: torch.Generator) -> Tensor:
     """Decoders of the represented vector itself, for vectors anywhere in the ball."""
-    dimensions = tuning.encoders.shape[-1]
+    dimensions = neurons.weights.shape[-1]
     points = torch.randn(1, _SOLVER_POINTS, dimensions, generator=draw)
     share = torch.rand(1, _SOLVER_POINTS, 1, generator=draw) ** (1.0 / dimensions)
-    points = tuning.radius * share * points / points.norm(dim=-1, keepdim=True)
-    current = torch.baddbmm(tuning.bias.unsqueeze(1), points, tuning.weights.mT)
-    return solve_decoders(rates(current, config), points)
+    points = radius * share * points / points.norm(dim=-1, keepdim=True)
+    return solve_decoders(rates(neurons.currents(points), neurons.config), points)

@@ -21,6 +21,7 @@ from neuroslam.spiking.neurons import (
     stepped_lif,
     stepped_lif_rate,
 )
+from neuroslam.spiking.rounding import rounded
 from neuroslam.state.mergeable import BufferModule
 
 
@@ -214,8 +215,9 @@ class NeuronArray(BufferModule):
 
     :func:`neuroslam.spiking.neurons.lif_step` has the mathematics. Groups lead and animals come
     second, so that one batched matrix product serves all of them. State: ``weights`` (encoders with
-    gain), ``bias``, and what each neuron carries, ``deficit`` and ``asleep``. What fired in the
-    last step are in ``spikes``, for recorders.
+    gain) and ``bias``, both rounded if the config has ``weight_bits``, and what each neuron
+    carries, ``deficit`` and ``asleep``. What fired in the last step are in ``spikes``, for
+    recorders.
 
     Args:
         tuning: What the neurons respond to.
@@ -250,8 +252,9 @@ class NeuronArray(BufferModule):
         self.config = config
         self.time_step_s = time_step_s
         self.membrane = Membrane(config.tau_rc_s, config.tau_ref_s)
-        self.register_buffer("weights", tuning.weights)
-        self.register_buffer("bias", tuning.bias)
+        weights, bias, bits = tuning.weights, tuning.bias, config.weight_bits
+        self.register_buffer("weights", rounded(weights, bits) if bits else weights)
+        self.register_buffer("bias", rounded(bias, bits) if bits else bias)
         groups, neurons = tuning.bias.shape
         start = torch.rand(groups, 1, neurons, generator=generator).expand(-1, batch, -1)
         state = resting(start.contiguous())

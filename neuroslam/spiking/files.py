@@ -23,7 +23,8 @@ def save_semantic_map(slam: SSPSLAM, path: str | Path) -> None:
     about = {
         "format": FORMAT_VERSION,
         "kind": _KIND,
-        "config": slam.given.model_dump(mode="json"),
+        # The semantic map of a brain has a config with more keys: what its landmarks are.
+        "config": slam.given.model_dump(mode="json", include=set(SSPSLAMConfig.model_fields)),
         "names": list(slam.names),
         "batch": slam.batch,
     }

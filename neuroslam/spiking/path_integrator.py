@@ -111,7 +111,7 @@ def coupled(
     return inner if pull is None else pull + inner
 
 
-class Packet(BufferModule, ABC):
+class BasePathIntegrator(BufferModule, ABC):
     """Base of both path integrators: the position that the phases encode.
 
     State: ``position_m`` ``(batch, dimension)``, ``age`` in steps, and the space's parameters.
@@ -205,7 +205,7 @@ class Packet(BufferModule, ABC):
                 x[:] = found
 
 
-class PathIntegrator(Packet):
+class PathIntegrator(BasePathIntegrator):
     """Represents a position by phases of oscillators whose frequency the velocity sets.
 
     :func:`oscillator_dynamics` has the mathematics. Each oscillator is a population of neurons for

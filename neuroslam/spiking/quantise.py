@@ -3,14 +3,13 @@
 import copy
 from typing import TypeVar
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from neuroslam.config.semantic import SSPSLAMConfig
 from neuroslam.errors import SpaceError
 from neuroslam.spiking.ensemble import NeuronArray
+from neuroslam.spiking.rounding import WEIGHT_BITS, rounded
 
-WEIGHT_BITS = 8
 _WEIGHTS = ("weights", "bias", "decoders", "encoders", "error_decoders", "relay_decoders")
 
 _TUNED_TO_KEYS = 20.0  # ratio of the squared rates of neurons tuned to a key, to others
@@ -18,33 +17,12 @@ _TUNED_TO_KEYS = 20.0  # ratio of the squared rates of neurons tuned to a key, t
 Module = TypeVar("Module", bound=nn.Module)
 
 
-def rounded(weights: Tensor, bits: int = WEIGHT_BITS) -> Tensor:
-    r"""Round weights to signed integers times one power of two for each population.
-
-    .. math:: w \leftarrow 2^{e} \operatorname{round}(w / 2^{e}), \qquad
-              \max |w| \le 2^{e} (2^{b-1} - 1)
-
-    (Loihi; Davies et al. 2018).
-
-    Args:
-        weights: Of some populations, which lead, ``(groups, ...)``.
-        bits: Of a weight, its sign among them.
-
-    Example:
-        >>> rounded(torch.tensor([[0.3, -1.0, 0.004]])).tolist()
-        [[0.296875, -1.0, 0.0]]
-    """
-    most = weights.abs().flatten(1).amax(1).clamp_min(torch.finfo(weights.dtype).tiny)
-    step = torch.exp2(torch.ceil(torch.log2(most / (2 ** (bits - 1) - 1))))
-    step = step.reshape(-1, *[1] * (weights.ndim - 1))
-    return (weights / step).round() * step
-
-
 def quantised(module: Module, bits: int = WEIGHT_BITS) -> Module:
     """Return a copy of a module of neurons whose weights have a few bits.
 
     Encoders with their gain, biases and decoders are rounded, each population's with its own
-    power of two. Weights that are learnt afterwards are not.
+    power of two. Weights that are learnt afterwards are not. Decoders should be solved for rounded
+    neurons: make these with ``weight_bits``, and only decoders are left to round.
 
     Args:
         module: Anything made of :class:`~neuroslam.spiking.ensemble.NeuronArray`.
@@ -75,7 +53,9 @@ def on_chip(config: SSPSLAMConfig) -> SSPSLAMConfig:
         )
     return config.model_copy(
         update={
-            "neurons": config.neurons.model_copy(update={"model": "stepped_lif"}),
+            "neurons": config.neurons.model_copy(
+                update={"model": "stepped_lif", "weight_bits": WEIGHT_BITS}
+            ),
             "integrator": config.integrator.model_copy(update={"coupling": "none"}),
             "map": config.map.model_copy(
                 update={

@@ -50,6 +50,7 @@ _GATE_WIDTH = 0.02  # range of similarity over which the gate opens
 _SETTLED_S = 0.15  # time until neurons represent a landmark and its position is learnt
 _AREA_INTERCEPT = 0.05  # similarity above which cells of the position memory fire
 _CONTRADICTS, _AGREES = 0.5, 0.7  # similarities; side lobes of a space are below the first
+_FADES = 0.25  # of a contradiction, in each second in which no known landmark is attended to
 _LOST_GAIN = 1.0  # gain of a correction when lost
 
 
@@ -349,7 +350,8 @@ class SSPSLAM(BufferModule):
         Returns:
             Time until a landmark is settled, time until the animal is lost, least plasticity,
             similarity below which a landmark contradicts, time step, gate and its width, gain, gain
-            when lost, similarity above which a landmark agrees. And flags: whether known landmarks
+            when lost, similarity above which a landmark agrees, and by how much a contradiction
+            fades in a step. And flags: whether known landmarks
             are learnt more slowly, whether an animal is never lost, whether neurons are quantised,
             and room for four more.
         """
@@ -357,7 +359,8 @@ class SSPSLAM(BufferModule):
         settled = 1.5 * dt if c.tier == "algebraic" else _SETTLED_S
         model = np.array(
             [settled, c.relocalise_after_s, c.map.least_plasticity, _CONTRADICTS, dt,
-             float(self.gate), _GATE_WIDTH, float(self.gain), _LOST_GAIN, _AGREES], dtype=kind,
+             float(self.gate), _GATE_WIDTH, float(self.gain), _LOST_GAIN, _AGREES, _FADES * dt],
+            dtype=kind,
         )  # fmt: skip
         novelty, never = c.map.plasticity == "novelty", c.relocalise_after_s == 0
         return model, np.array([novelty, never, c.quantised, 0, 0, 0, 0])
@@ -613,11 +616,16 @@ class SSPSLAM(BufferModule):
         return self.contradicted_s > after
 
     def _note_contradiction(self, known: Tensor, agreement: Tensor) -> None:
-        """Measure for how long known landmarks contradict; one that clearly agrees resets it."""
-        more = self.contradicted_s + self.config.time_step_s
+        """Measure for how long known landmarks contradict; one that clearly agrees resets it.
+
+        Without a known landmark it fades: else one outlier would end all learning of new ones.
+        """
+        dt = self.config.time_step_s
+        more = self.contradicted_s + dt
+        less = (self.contradicted_s - _FADES * dt).clamp_min(0.0)
         longer = torch.where(agreement < _CONTRADICTS, more, self.contradicted_s)
         longer = torch.where(agreement > _AGREES, 0.0, longer)
-        self.contradicted_s = torch.where(known, longer, self.contradicted_s).detach()
+        self.contradicted_s = torch.where(known, longer, less).detach()
 
     def _inputs(self, velocity: Tensor, view: LandmarkView | None) -> tuple[Tensor, Sight]:
         """Check and prepare the inputs of some steps, without changing the state."""

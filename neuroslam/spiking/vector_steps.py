@@ -407,6 +407,9 @@ def after_recall(
             contradicted[0] += model[4]
         if said[2] > model[9]:
             contradicted[0] = 0.0
+    else:
+        left = contradicted[0] - model[10]
+        contradicted[0] = left if left > 0.0 else 0.0
     gain = model[8] if lost and known else model[7] * said[1]
     size = strength_of(implied)
     size = size if size > 1e-3 else 1e-3

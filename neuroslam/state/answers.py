@@ -32,7 +32,7 @@ RUN_FIGURES = (
 RUN_TAGS = (
     "view/templates", "view/match_error", "view/frame_and_template", "map/experiences", "map/links",
     "map/largest_correction", "map/experiences_and_links", "run/frames_per_s", "cells/place_map",
-    "cells/boundary_response", "cells/grid_rate_maps",
+    "cells/boundary_response", "cells/grid_rate_maps", "cells/boundary_cells", "cells/place_bump",
 )  # fmt: skip
 """Tags of TensorBoard that a run writes itself: a population's must be called otherwise."""
 

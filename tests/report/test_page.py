@@ -16,6 +16,7 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.report import write_report
 from neuroslam.runs.files import RowWriter, RunPlan
+from neuroslam.runs.plan import plan
 from neuroslam.runs.reading import read_frames
 from neuroslam.runs.results import RunSummary, write_results
 from neuroslam.runs.run import run
@@ -282,6 +283,20 @@ def test_layers_and_colours_change_what_is_drawn(page):
     assert changed(picture(page), before) == 0
     page.locator("#colouring").select_option("visits")
     assert changed(picture(page), before) > 500
+
+
+def test_the_planned_path_is_drawn(show, runs, tmp_path):
+    out = shutil.copytree(runs / "second", tmp_path / "out")
+    assert write_report(out) == out / "report.html"
+    without = picture(show(out / "report.html"))
+    plan(out, "3", start="20")
+    page = show(write_report(out))
+    drawn = picture(page)
+    assert changed(drawn, without) > 200
+    assert "planned path" in page.locator("#legend").inner_text()
+    page.locator(".layers summary").click()
+    page.locator("[data-layer=plan]").uncheck()
+    assert changed(picture(page), without) == 0
 
 
 def test_only_what_differs_can_be_shown_of_the_config(page):

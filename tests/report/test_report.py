@@ -24,6 +24,7 @@ from neuroslam.report.collect import chosen_rows
 from neuroslam.report.pictures import base64_size, take_pictures
 from neuroslam.report.reading import Curve, read_run
 from neuroslam.report.rows import config_rows, metric_rows
+from neuroslam.runs.plan import plan
 from neuroslam.runs.run import resume, run
 from neuroslam.sensors import open_source
 
@@ -377,6 +378,19 @@ def test_rows_after_the_last_save_are_left_out(runs, tmp_path):
     assert len(Page(write_report(out, pictures_mb=0, source=True)).arrays["row_frame"]) == 70
 
 
+def test_a_planned_path_is_on_the_page_as_long_as_its_links_are_on_the_map(runs, tmp_path):
+    out = shutil.copytree(runs / "whole", tmp_path / "out")
+    path = plan(out, "2", start="9").path
+    page = Page(write_report(out, pictures_mb=0))
+    assert page.arrays["plan_place"].tolist() == path
+    (note,) = (note for note in page.about["notes"] if note.startswith("Planned path"))
+    assert note.startswith(f"Planned path: from experience 9 to 2, {len(path) - 1} links, ")
+    (out / "plan.csv").write_text("step,experience\n0,0\n1,9\n")  # no link leads from 0 to 9
+    page = Page(write_report(out, pictures_mb=0))
+    assert "plan_place" not in page.arrays
+    assert any("plan.csv is of another map" in note for note in page.about["notes"])
+
+
 def test_a_page_is_made_alike_every_time(runs, tmp_path):
     one, other = (
         write_report(runs / "rat", tmp_path / name, source=True) for name in ("1.html", "2.html")
@@ -437,6 +451,8 @@ def damaged(runs, tmp_path, name, change):
         ("trace.f64", lambda p: os.truncate(p, 960), "trace.f64: damaged"),
         ("brain.safetensors", lambda p: p.unlink(), "brain.safetensors"),
         ("brain.safetensors", lambda p: os.truncate(p, 999), "brain.safetensors"),
+        ("plan.csv", lambda p: p.write_text("step,place\n0,1\n"), "plan.csv: damaged"),
+        ("plan.csv", lambda p: p.write_bytes(b"\xff\n\xff"), "plan.csv: damaged"),
     ],
 )  # fmt: skip
 def test_a_damaged_run_is_one_line_and_no_page(name, change, said, runs, tmp_path, mistake):

@@ -124,6 +124,23 @@ def test_of_many_templates_the_projector_gets_an_even_choice(tmp_path):
     assert names[:3] == ["template 0", "template 4", "template 8"]
 
 
+def test_panels_can_be_seen_while_a_run_goes_on(tmp_path):
+    over = {"wall_memory": {"senses": "boundary_cells"}, "place_cells": {"excitation": 0.5}}
+    brain = NavigationBrain(build_config(merge_values(read_preset("slrb"), over)))
+    with TensorBoardRecorder(tmp_path) as recorder:
+        for frame in open_source("arena:square?minutes=0.2&noise=1&ranges=60").frames(0, 120):
+            recorder.step(brain(frame), frame, brain)
+        events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
+        events.Reload()
+        images = {tag: events.Images(tag) for tag in events.Tags()["images"]}
+    assert set(images) == {
+        "map/experiences_and_links", "cells/place_map", "cells/place_bump", "cells/boundary_cells",
+    }  # fmt: skip
+    assert all([drawn.step for drawn in each] == [50, 100] for each in images.values())
+    for tag in ("cells/place_bump", "cells/boundary_cells"):
+        assert pixels(images[tag][-1]).std() > 10.0
+
+
 def test_a_brain_of_boundary_grid_and_place_cells_is_recorded_too(tmp_path):
     brain = NavigationBrain(build_config(read_preset("slrb")))
     with TensorBoardRecorder(tmp_path) as recorder:
@@ -135,6 +152,8 @@ def test_a_brain_of_boundary_grid_and_place_cells_is_recorded_too(tmp_path):
     assert set(tags["images"]) == {
         "map/experiences_and_links",
         "cells/place_map",
+        "cells/place_bump",
+        "cells/boundary_cells",
         "cells/boundary_response",
         "cells/grid_rate_maps",
     }

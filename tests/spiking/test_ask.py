@@ -15,7 +15,13 @@ from neuroslam.errors import SpaceError
 from neuroslam.experiments.semantic_maps import CELLS, STAGES, Trial, score
 from neuroslam.runs.ask import AskedMap
 from neuroslam.sensors.landmarks import LandmarkWords
-from neuroslam.spiking import SSPSLAM, queries, save_semantic_map
+from neuroslam.spiking import (
+    SSPSLAM,
+    load_semantic_map,
+    merge_semantic_maps,
+    queries,
+    save_semantic_map,
+)
 from neuroslam.spiking.ask import EXAMPLES, ask, contents, parse_question
 from neuroslam.spiking.semantic import SemanticCells
 from neuroslam.spiking.semantic_joining import merge_landmarks
@@ -228,6 +234,23 @@ def test_an_outlier_of_a_later_session_does_not_move_a_landmark_in_a_merge():
     np.testing.assert_allclose(ask(merged, "where is door").found[0].position_m, (2, 0), atol=0.05)
 
 
+def test_one_outlier_of_a_known_landmark_does_not_end_the_learning_of_new_ones():
+    cells = SemanticCells(SemanticConfig())
+    cells.name_landmarks(WORDS)
+    door, lamp = np.array([[0.0, 2.0, 0.0]]), np.array([[1.0, 2.0, math.pi / 2.0]])
+    outlier = np.array([[0.0, 5.0, math.pi]])
+    nothing = np.empty((0, 3))
+    for rows in (*[door] * 20, nothing, door, door, outlier, outlier):
+        cells.advance(STILL, Sightings.of(rows), compass_rad=0.0)
+    assert 0.0 < float(cells.slam.contradicted_s) < cells.config.relocalise_after_s
+    for _ in range(30):
+        cells.advance(STILL, Sightings.of(lamp), compass_rad=0.0)
+    assert float(cells.slam.contradicted_s) == 0.0
+    for name, position_m in (("lamp", (0, 2)), ("door", (2, 0))):
+        found = ask(cells, f"where is {name}").found[0]
+        np.testing.assert_allclose(found.position_m, position_m, atol=0.05)
+
+
 # --- runs --------------------------------------------------------------------------------------
 
 
@@ -279,6 +302,23 @@ def test_a_semantic_map_file_is_asked_too(tmp_path):
     save_semantic_map(slam, tmp_path / "map.safetensors")
     answer = AskedMap(tmp_path / "map.safetensors").ask("where is lamp")
     np.testing.assert_allclose(answer.found[0].position_m, (-0.3, 0.6), atol=1e-3)
+
+
+@pytest.mark.parametrize("config", [{}, {"places": True, "sigma_distance_m": 0.1}])
+def test_the_map_of_a_brain_is_written_to_a_file_of_its_own(tmp_path, config):
+    cells = taught(**config)
+    save_semantic_map(cells.slam, tmp_path / "map.safetensors")
+    again = load_semantic_map(tmp_path / "map.safetensors")
+    answer = ask(again, "where is door")
+    np.testing.assert_allclose(answer.found[0].position_m, (2.0, 0.0), atol=0.05)
+    assert again.names == ("DOOR", "LAMP", "DESK", "landmark_3")
+    state = cells.slam.state_dict()
+    assert all(torch.equal(tensor, state[name]) for name, tensor in again.state_dict().items())
+    on = [slam(torch.tensor([[0.3, 0.0]])).z for slam in (cells.slam, again)]
+    assert torch.equal(*on)
+    merged, report = merge_semantic_maps(again, again)
+    assert report.joined
+    assert merged.names == again.names
 
 
 def test_the_answers_of_a_map_are_right_after_save_resume_and_merge():
