@@ -167,10 +167,11 @@ class LAHNGridCells(BufferModule):
     """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
 
     :func:`lahn_drive`, :func:`lateral_kernel` and :func:`lahn_learn` have the mathematics. A
-    network is made with weights that developed at random positions, without an environment;
-    ``learn`` continues from there. State: the parameters ``feedforward`` and ``lateral``, the
-    buffers ``threshold``, ``bias`` and ``rates``, and the generator of its random weights. Animals
-    of a batch share one network.
+    network is made with weights that developed at random positions, without an environment; with
+    ``learns_online`` it continues while the animal moves, by smaller steps: positions in a row are
+    alike, and steps as large as those of development let the fields wander. State: the parameters
+    ``feedforward`` and ``lateral``, the buffers ``threshold``, ``bias`` and ``rates``, and the
+    generator of its random weights. Animals of a batch share one network.
 
     Args:
         config: Modules, cells, learning rates.
@@ -194,6 +195,9 @@ class LAHNGridCells(BufferModule):
         super().__init__()
         self.config = config
         self.batch = batch
+        rates = ("hebbian_rate", "lateral_rate", "threshold_rate")
+        slower = {name: config.online_share * getattr(config, name) for name in rates}
+        self._online = config.model_copy(update=slower)
         m, n, inputs = len(config.spacings_m), config.n_cells, 2 * config.directions
         generator = torch.Generator().manual_seed(config.seed)
         start = torch.randn(m, n, inputs, generator=generator)
@@ -257,12 +261,17 @@ class LAHNGridCells(BufferModule):
         self.generator_state = generator.get_state()
 
     @torch.no_grad()
-    def learn(self, inputs: Tensor) -> None:
-        """Learn from inputs, ``(samples, n_modules, 2 * directions)``, at settled rates."""
+    def learn(self, inputs: Tensor, config: GridCellConfig | None = None) -> None:
+        """Learn from inputs at settled rates.
+
+        Args:
+            inputs: ``(samples, n_modules, 2 * directions)``.
+            config: Learning rates; ``None``: those of development.
+        """
         q, _, _, bias = self.weights
         rates = (inputs.unsqueeze(-2) @ q.mT).squeeze(-2).sub(bias).clamp_min(0.0)
         drive = lahn_drive(inputs, rates, q, self.coupling)
-        learnt = lahn_learn(inputs, drive, self.weights, self.config)
+        learnt = lahn_learn(inputs, drive, self.weights, config or self.config)
         self.feedforward.copy_(learnt.feedforward)
         if self.config.lateral != "kernel":
             self.lateral.copy_(learnt.lateral)
@@ -283,7 +292,7 @@ class LAHNGridCells(BufferModule):
         self.rates = rates.detach()
         if self.config.learns_online:
             with torch.no_grad():
-                self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]))
+                self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]), self._online)
         return rates
 
     def rates_compiled(self, phases: np.ndarray) -> np.ndarray:
@@ -293,5 +302,6 @@ class LAHNGridCells(BufferModule):
             lateral = self.coupling.detach().contiguous().numpy()
         rates_step(phases, feedforward, lateral, bias, rates)
         if self.config.learns_online:
-            self.learn(torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)[None])
+            inputs = torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)
+            self.learn(inputs[None], self._online)
         return rates

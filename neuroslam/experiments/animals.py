@@ -133,6 +133,31 @@ def run_cells(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCell
     return cells
 
 
+def run_one(
+    senses: Senses, animal: int, config: BrainConfig, hook: Hook, every: int = 1
+) -> NavigationCells:
+    """Run the cells of one animal of several, by compiled steps; return them in their final state.
+
+    Args:
+        senses: Sensor data.
+        animal: Its row.
+        config: Of the brain.
+        hook: Called after every step.
+        every: Walls are looked for at every ``every``-th step, not at the others.
+    """
+    cells = NavigationCells(config)
+    columns = [
+        torch.from_numpy(np.ascontiguousarray(column[animal]))
+        for column in (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
+    ]
+    with torch.inference_mode():
+        for i, (dt_s, *felt) in enumerate(zip(senses.dt_s.tolist(), *columns, strict=True)):
+            speed, heading, wall, bearing = felt
+            sensed = (i + 1) % every == 0
+            hook(i, cells(speed, heading, dt_s, wall, bearing, sensed=sensed), cells)
+    return cells
+
+
 def path_integration(senses: Senses) -> np.ndarray:
     """Return dead-reckoned positions from the true start, ``(seeds, steps, 2)``."""
     steps = senses.speed_m_s * senses.dt_s

@@ -33,6 +33,8 @@ from neuroslam.sensors.source import IndexedSource
 from neuroslam.state.files import write_atomically
 from neuroslam.worlds.world import WorldSource
 
+_APART_M = 8.0  # from the crossing in the middle of the town: beyond its curves
+
 Cut = tuple[int, int]
 """First frame of a session, and the frame after its last."""
 
@@ -47,6 +49,7 @@ class Plan(NamedTuple):
         config: Parameters that differ from the preset.
         paper_rmse: The paper's ICP RMSE, in its own map units; NaN without one.
         preset: Name of the preset; empty: the defaults.
+        table_1: Name of the preset with the column of the paper's Table 1.
     """
 
     title: str
@@ -55,6 +58,7 @@ class Plan(NamedTuple):
     config: dict[str, Any] = {}  # noqa: RUF012
     paper_rmse: float = math.nan
     preset: str = ""
+    table_1: str = ""
 
 
 def equal_parts(k: int) -> Callable[[IndexedSource], list[Cut]]:
@@ -86,6 +90,22 @@ def _town(source: IndexedSource) -> list[Cut]:
     return _cut_at_passes(source, (0.0, 0.0), 4.0, (3, 5, 7, 9))
 
 
+def _town_apart(source: IndexedSource) -> list[Cut]:
+    """Cut as :func:`_town`, but leave out where one session goes over into the next.
+
+    So no two of the four laps have a pose in common: they pass the crossing in the middle in four
+    directions, and the streets between two blocks in opposite ones.
+    """
+    far = np.hypot(*_truths(source)[:, :2].T) > _APART_M
+    cuts = []
+    for first, stop in _town(source):
+        on = first + np.flatnonzero(far[first:stop])
+        cuts.append(
+            (int(on[0]) if first else 0, int(on[-1]) + 1 if stop < source.n_frames else stop)
+        )
+    return cuts
+
+
 def _campus(source: IndexedSource) -> list[Cut]:
     """Cut into laps of the court, laps of the park, and laps of everything."""
     truth = _truths(source)
@@ -110,12 +130,15 @@ def _cut_at_passes(
     return list(zip([0, *ends], [*ends, source.n_frames], strict=True))
 
 
+_OF_THE_CAMERA = ("odometry", "frame_rate_hz")
+
 PLANS = {
     "virtual-tour": Plan(
         "Virtual tour",
         "world:ellipse?laps=3.8&width=256&height=64",
         _virtual_tour,
         paper_rmse=0.00773327,
+        table_1="virtual_tour",
     ),
     "lab-tour": Plan(
         "Lab tour",
@@ -123,6 +146,7 @@ PLANS = {
         _lab_tour,
         {"odometry": {"speed_scaling_m_s": 50.0}, "pose_cells": {"cell_size_m": 0.5}},
         paper_rmse=0.00883269,
+        table_1="lab_tour",
     ),
     "five-sessions": Plan(
         "Five sessions in a town",
@@ -133,6 +157,7 @@ PLANS = {
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=0.0127,
+        table_1="irat",
     ),
     "campus": Plan(
         "Three sessions on a campus",
@@ -143,8 +168,12 @@ PLANS = {
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=85.0,
+        table_1="new_college",
     ),
 }
+PLANS["five-sessions-apart"] = PLANS["five-sessions"]._replace(
+    title="Five sessions in a town, four of them apart", cuts=_town_apart
+)
 
 
 class Result(NamedTuple):
@@ -166,6 +195,21 @@ def run_plan(plan: Plan, overrides: dict[str, Any] | None = None) -> Result:
     single = run_session(source.frames(), config, name=plan.source)
     cuts = plan.cuts(source)
     return Result(single, _sessions(plan, config, source, cuts), cuts, source)
+
+
+def with_table_1(plan: Plan) -> Plan:
+    """Return a plan with the parameters of the paper's Table 1.
+
+    What belongs to the camera or to the scale of the world stays: the section ``odometry`` and the
+    size of a pose cell.
+    """
+    values = read_preset(plan.table_1)
+    values = {name: part for name, part in values.items() if name not in _OF_THE_CAMERA}
+    ours = plan.config.get("pose_cells", {})
+    cell = {"cell_size_m": ours.get("cell_size_m", BrainConfig().pose_cells.cell_size_m)}
+    own = {"odometry": plan.config.get("odometry", {}), "pose_cells": cell}
+    title = f"{plan.title}, parameters of Table 1"
+    return plan._replace(config=merge_values(values, own), preset="", title=title)
 
 
 def _sessions(
@@ -247,7 +291,20 @@ def _repeat(name: str, out: Path) -> dict[str, Any]:
     plan, out = PLANS[name], Path(out)
     result = run_plan(plan)
     draw(plan, result, out)
-    return _write(name, _rows(plan, result), result.runs, out)
+    rows, runs = _rows(plan, result), result.runs
+    extra, extra_runs = _by_table_1(plan, out)
+    return _write(name, rows + extra, runs + extra_runs, out)
+
+
+def _by_table_1(plan: Plan, out: Path) -> tuple[list[dict[str, Any]], list[SessionRun]]:
+    """Run a plan with the parameters of Table 1; return rows and runs, and draw them."""
+    printed = with_table_1(plan)
+    result = run_plan(printed)
+    draw(printed, result, out, "table_1_")
+    rows = _rows(printed, result)
+    for row in rows:
+        row["map"] += ", parameters of Table 1"
+    return rows, result.runs
 
 
 def virtual_tour(_data: Path | None, out: Path) -> dict[str, Any]:
@@ -265,6 +322,11 @@ def five_sessions(_data: Path | None, out: Path) -> dict[str, Any]:
     return _repeat("five-sessions", out)
 
 
+def five_sessions_apart(_data: Path | None, out: Path) -> dict[str, Any]:
+    """Map the blocks of a town in four sessions that share no pose, and join them in a fifth."""
+    return _repeat("five-sessions-apart", out)
+
+
 def campus(_data: Path | None, out: Path) -> dict[str, Any]:
     """Map a campus of more than 20 000 frames in three sessions (paper's Figs. 17, 18).
 
@@ -278,7 +340,8 @@ def campus(_data: Path | None, out: Path) -> dict[str, Any]:
     rows.append(_rows(plan, by_rule, "multi-session, rule of the paper")[1])
     draw(plan, result, out)
     draw(plan._replace(title=f"{plan.title}, rule of the paper"), by_rule, out, "rule_of_paper_")
-    return _write("campus", rows, [*result.runs, *by_rule.runs], out)
+    extra, extra_runs = _by_table_1(plan, out)
+    return _write("campus", rows + extra, [*result.runs, *by_rule.runs, *extra_runs], out)
 
 
 def virtual_tour_no_shift(_data: Path | None, out: Path) -> dict[str, Any]:
