@@ -96,7 +96,8 @@ def test_four_of_the_five_sessions_apart_share_no_pose_and_the_fifth_meets_each(
         turned = np.abs((a[:, None, 2] - b[:, 2] + np.pi) % (2 * np.pi) - np.pi)
         return apart[turned < np.radians(45.0)].min()
 
-    assert min(nearest_m(a, b) for k, a in enumerate(laps[:4]) for b in laps[:k]) > 5.0
+    cells_m = 2 * PLANS["five-sessions-apart"].config["pose_cells"]["cell_size_m"]
+    assert min(nearest_m(a, b) for k, a in enumerate(laps[:4]) for b in laps[:k]) > cells_m
     assert max(nearest_m(lap, laps[4]) for lap in laps[:4]) < 0.5
 
 
