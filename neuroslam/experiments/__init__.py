@@ -19,6 +19,7 @@ EXPERIMENTS = {
     "five-sessions": (_SESSIONS, "five_sessions", None),
     "five-sessions-apart": (_SESSIONS, "five_sessions_apart", None),
     "campus": (_SESSIONS, "campus", None),
+    "table-1": (_SESSIONS, "table_1", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
     "compare": ("neuroslam.experiments.compare", "compare", None),
     "pixel-landmarks": ("neuroslam.experiments.compare", "pixel_landmarks", None),

@@ -12,9 +12,11 @@ from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.config import BoundaryCellConfig, BrainConfig
 from neuroslam.experiments.animals import (
     RATE_HZ,
+    RECTANGLE,
     TRACKS,
     WALLS,
     arena_of,
+    has_rectangle,
     position_errors,
     read_track,
     run_one,
@@ -57,7 +59,7 @@ def boundary_cells_in_loop(
     minutes: float = 30.0,
     seeds: Sequence[int] = range(10),
     few_seeds: Sequence[int] = range(3),
-    tracks: Sequence[str] = tuple(TRACKS),
+    tracks: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Compare positions with raw walls, with boundary cells, and with the cells impaired.
 
@@ -67,12 +69,14 @@ def boundary_cells_in_loop(
         minutes: Length of a walk.
         seeds: Seed of the noise of each animal.
         few_seeds: The same for walks with noisy beams, and with impaired cells.
-        tracks: Names of tracks.
+        tracks: Names of tracks; ``None``: all of ``TRACKS``, and ``RECTANGLE`` if it is installed.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each track, input and condition.
     """
     out, rows = Path(out_folder), []
+    if tracks is None:
+        tracks = (*TRACKS, RECTANGLE) if has_rectangle() else tuple(TRACKS)
     for name in tracks:
         walk = read_track(Path(data_folder), name, minutes)
         for condition in CONDITIONS:
@@ -85,15 +89,12 @@ def boundary_cells_in_loop(
             row = run(felt, walk, condition, SCAN_EVERY)
             rows.append({"track": name, "input": "noisy beams", **row})
     for kind in ("feet", "noisy beams"):
-        errors = {
-            condition: {
-                row["track"]: np.array(row["errors_m"])
-                for row in rows
-                if row["input"] == kind and row["condition"] == condition
-            }
-            for condition in CONDITIONS
-        }
-        errors = {condition: values for condition, values in errors.items() if values}
+        few = len(few_seeds) if kind == "feet" else None  # the same seeds for all conditions
+        errors: dict[str, dict[str, np.ndarray]] = {}
+        for row in rows:
+            if row["input"] == kind:
+                own = errors.setdefault(row["condition"], {})
+                own[row["track"]] = np.array(row["errors_m"][:few])
         title = f"Boundary cells in the loop: walls as {kind}, {minutes:g} min"
         colours = dict(zip(CONDITIONS, CURVES, strict=False))
         figure = plot_errors(errors, title=title, colours=colours)

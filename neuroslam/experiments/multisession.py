@@ -6,7 +6,7 @@ Rendered worlds with similar routes replace recordings that are not public.
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,7 +49,6 @@ class Plan(NamedTuple):
         config: Parameters that differ from the preset.
         paper_rmse: The paper's ICP RMSE, in its own map units; NaN without one.
         preset: Name of the preset; empty: the defaults.
-        table_1: Name of the preset with the column of the paper's Table 1.
     """
 
     title: str
@@ -58,7 +57,6 @@ class Plan(NamedTuple):
     config: dict[str, Any] = {}  # noqa: RUF012
     paper_rmse: float = math.nan
     preset: str = ""
-    table_1: str = ""
 
 
 def equal_parts(k: int) -> Callable[[IndexedSource], list[Cut]]:
@@ -130,6 +128,14 @@ def _cut_at_passes(
     return list(zip([0, *ends], [*ends, source.n_frames], strict=True))
 
 
+TABLE_1 = (
+    ("virtual-tour", "virtual_tour"),
+    ("lab-tour", "lab_tour"),
+    ("five-sessions-apart", "irat"),
+    ("campus", "new_college"),
+)
+"""Experiment, and preset with its column of the paper's Table 1."""
+
 _OF_THE_CAMERA = ("odometry", "frame_rate_hz")
 
 PLANS = {
@@ -138,7 +144,6 @@ PLANS = {
         "world:ellipse?laps=3.8&width=256&height=64",
         _virtual_tour,
         paper_rmse=0.00773327,
-        table_1="virtual_tour",
     ),
     "lab-tour": Plan(
         "Lab tour",
@@ -146,7 +151,6 @@ PLANS = {
         _lab_tour,
         {"odometry": {"speed_scaling_m_s": 50.0}, "pose_cells": {"cell_size_m": 0.5}},
         paper_rmse=0.00883269,
-        table_1="lab_tour",
     ),
     "five-sessions": Plan(
         "Five sessions in a town",
@@ -157,7 +161,6 @@ PLANS = {
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=0.0127,
-        table_1="irat",
     ),
     "campus": Plan(
         "Three sessions on a campus",
@@ -168,7 +171,6 @@ PLANS = {
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=85.0,
-        table_1="new_college",
     ),
 }
 PLANS["five-sessions-apart"] = PLANS["five-sessions"]._replace(
@@ -197,14 +199,15 @@ def run_plan(plan: Plan, overrides: dict[str, Any] | None = None) -> Result:
     return Result(single, _sessions(plan, config, source, cuts), cuts, source)
 
 
-def with_table_1(plan: Plan) -> Plan:
-    """Return a plan with the parameters of the paper's Table 1.
+def with_table_1(plan: Plan, preset: str) -> Plan:
+    """Return a plan with the parameters of a preset of the paper's Table 1.
 
     What belongs to the camera or to the scale of the world stays: the section ``odometry`` and the
     size of a pose cell.
     """
-    values = read_preset(plan.table_1)
-    values = {name: part for name, part in values.items() if name not in _OF_THE_CAMERA}
+    values = {
+        name: part for name, part in read_preset(preset).items() if name not in _OF_THE_CAMERA
+    }
     ours = plan.config.get("pose_cells", {})
     cell = {"cell_size_m": ours.get("cell_size_m", BrainConfig().pose_cells.cell_size_m)}
     own = {"odometry": plan.config.get("odometry", {}), "pose_cells": cell}
@@ -291,20 +294,21 @@ def _repeat(name: str, out: Path) -> dict[str, Any]:
     plan, out = PLANS[name], Path(out)
     result = run_plan(plan)
     draw(plan, result, out)
-    rows, runs = _rows(plan, result), result.runs
-    extra, extra_runs = _by_table_1(plan, out)
-    return _write(name, rows + extra, runs + extra_runs, out)
+    return _write(name, _rows(plan, result), result.runs, out)
 
 
-def _by_table_1(plan: Plan, out: Path) -> tuple[list[dict[str, Any]], list[SessionRun]]:
-    """Run a plan with the parameters of Table 1; return rows and runs, and draw them."""
-    printed = with_table_1(plan)
-    result = run_plan(printed)
-    draw(printed, result, out, "table_1_")
-    rows = _rows(printed, result)
-    for row in rows:
-        row["map"] += ", parameters of Table 1"
-    return rows, result.runs
+def table_1(
+    _data: Path | None, out: Path, names: Sequence[str] = tuple(name for name, _ in TABLE_1)
+) -> dict[str, Any]:
+    """Run the experiments with the parameters of the paper's Table 1, on the same frames."""
+    out, rows, runs = Path(out), list[dict[str, Any]](), list[SessionRun]()
+    for name in names:
+        plan = with_table_1(PLANS[name], dict(TABLE_1)[name])
+        result = run_plan(plan)
+        draw(plan, result, out, f"{name.replace('-', '_')}_")
+        rows += [{"experiment": name, **row} for row in _rows(plan, result)]
+        runs += result.runs
+    return _write("table-1", rows, runs, out)
 
 
 def virtual_tour(_data: Path | None, out: Path) -> dict[str, Any]:
@@ -340,8 +344,7 @@ def campus(_data: Path | None, out: Path) -> dict[str, Any]:
     rows.append(_rows(plan, by_rule, "multi-session, rule of the paper")[1])
     draw(plan, result, out)
     draw(plan._replace(title=f"{plan.title}, rule of the paper"), by_rule, out, "rule_of_paper_")
-    extra, extra_runs = _by_table_1(plan, out)
-    return _write("campus", rows + extra, [*result.runs, *by_rule.runs, *extra_runs], out)
+    return _write("campus", rows, [*result.runs, *by_rule.runs], out)
 
 
 def virtual_tour_no_shift(_data: Path | None, out: Path) -> dict[str, Any]:

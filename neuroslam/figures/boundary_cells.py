@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from neuroslam.figures.style import ACTIVITY, LOOP, STYLE, new_figure, write_title
@@ -57,7 +59,7 @@ def plot_active_cells(
     with mpl.rc_context(STYLE):
         figure = new_figure(2.6 * len(paths) + 1.0, 2.75 * rows + 0.6, title)
         axes = figure.subplots(rows, len(paths), squeeze=False, subplot_kw={"projection": "polar"})
-        norm = mpl.colors.Normalize(0.0, 1.0)
+        norm = Normalize(0.0, 1.0)
         for row, path in zip(axes.T, paths, strict=True):
             for ax, moment, rates in zip(row, path.moments, path.rates, strict=True):
                 ax.pcolormesh(*edges, rates.T, cmap=ACTIVITY, norm=norm, ec="#dddddd", lw=0.2)
@@ -69,6 +71,6 @@ def plot_active_cells(
                 ax.set_rlabel_position(225)
                 ax.grid(visible=False)
                 write_title(ax, f"{path.title}, {moment}", f"{int((rates > fires).sum())} fire")
-        bar = mpl.cm.ScalarMappable(norm, ACTIVITY)
+        bar = ScalarMappable(norm, ACTIVITY)
         figure.colorbar(bar, ax=axes, shrink=0.5, label="rate (1 at most)")
     return figure

@@ -148,11 +148,13 @@ def find_joint_start(spec: str, config: BrainConfig) -> JointStart:
     parts = pair_of(spec)
     if parts is None:
         raise SourceError(f"{spec}: is one source; expected a camera and motion")
-    sources = [open_source(part, config.frame_rate_hz, config.view.grey) for part in parts]
-    if any(source.live for source in sources):
+    camera, motion = (open_source(part, config.frame_rate_hz, config.view.grey) for part in parts)
+    if camera.live or motion.live:
         raise RunError(f"{spec}: is live; --offset auto reads its sources twice; give seconds")
     try:
-        return joint_start(*sources, config)
+        return joint_start(camera, motion, config)
+    except SourceError:
+        raise
     except ValueError as error:
         raise RunError(f"{spec}: {error}; give --offset S in seconds") from None
 

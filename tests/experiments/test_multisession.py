@@ -102,7 +102,7 @@ def test_four_of_the_five_sessions_apart_share_no_pose_and_the_fifth_meets_each(
 
 
 def test_table_1_replaces_all_but_what_belongs_to_the_camera_and_to_the_scale_of_the_world():
-    ours, printed = PLANS["lab-tour"], multisession.with_table_1(PLANS["lab-tour"])
+    ours, printed = PLANS["lab-tour"], multisession.with_table_1(PLANS["lab-tour"], "lab_tour")
     assert printed.config["odometry"] == ours.config["odometry"]
     assert printed.config["pose_cells"]["cell_size_m"] == 0.5
     assert printed.config["view"]["threshold"] == 0.04
