@@ -6,7 +6,7 @@ Rendered worlds with similar routes replace recordings that are not public.
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,8 +32,6 @@ from neuroslam.sensors import open_source
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.state.files import write_atomically
 from neuroslam.worlds.world import WorldSource
-
-_APART_M = 8.0  # from the crossing in the middle of the town: beyond its curves
 
 Cut = tuple[int, int]
 """First frame of a session, and the frame after its last."""
@@ -88,22 +86,6 @@ def _town(source: IndexedSource) -> list[Cut]:
     return _cut_at_passes(source, (0.0, 0.0), 4.0, (3, 5, 7, 9))
 
 
-def _town_apart(source: IndexedSource) -> list[Cut]:
-    """Cut as :func:`_town`, but leave out where one session goes over into the next.
-
-    So no two of the four laps have a pose in common: they pass the crossing in the middle in four
-    directions, and the streets between two blocks in opposite ones.
-    """
-    far = np.hypot(*_truths(source)[:, :2].T) > _APART_M
-    cuts = []
-    for first, stop in _town(source):
-        on = first + np.flatnonzero(far[first:stop])
-        cuts.append(
-            (int(on[0]) if first else 0, int(on[-1]) + 1 if stop < source.n_frames else stop)
-        )
-    return cuts
-
-
 def _campus(source: IndexedSource) -> list[Cut]:
     """Cut into laps of the court, laps of the park, and laps of everything."""
     truth = _truths(source)
@@ -127,16 +109,6 @@ def _cut_at_passes(
     ends = [int(inside[k - 1]) for k in passes]
     return list(zip([0, *ends], [*ends, source.n_frames], strict=True))
 
-
-TABLE_1 = (
-    ("virtual-tour", "virtual_tour"),
-    ("lab-tour", "lab_tour"),
-    ("five-sessions-apart", "irat"),
-    ("campus", "new_college"),
-)
-"""Experiment, and preset with its column of the paper's Table 1."""
-
-_OF_THE_CAMERA = ("odometry", "frame_rate_hz")
 
 PLANS = {
     "virtual-tour": Plan(
@@ -173,9 +145,6 @@ PLANS = {
         paper_rmse=85.0,
     ),
 }
-PLANS["five-sessions-apart"] = PLANS["five-sessions"]._replace(
-    title="Five sessions in a town, four of them apart", cuts=_town_apart
-)
 
 
 class Result(NamedTuple):
@@ -197,22 +166,6 @@ def run_plan(plan: Plan, overrides: dict[str, Any] | None = None) -> Result:
     single = run_session(source.frames(), config, name=plan.source)
     cuts = plan.cuts(source)
     return Result(single, _sessions(plan, config, source, cuts), cuts, source)
-
-
-def with_table_1(plan: Plan, preset: str) -> Plan:
-    """Return a plan with the parameters of a preset of the paper's Table 1.
-
-    What belongs to the camera or to the scale of the world stays: the section ``odometry`` and the
-    size of a pose cell.
-    """
-    values = {
-        name: part for name, part in read_preset(preset).items() if name not in _OF_THE_CAMERA
-    }
-    ours = plan.config.get("pose_cells", {})
-    cell = {"cell_size_m": ours.get("cell_size_m", BrainConfig().pose_cells.cell_size_m)}
-    own = {"odometry": plan.config.get("odometry", {}), "pose_cells": cell}
-    title = f"{plan.title}, parameters of Table 1"
-    return plan._replace(config=merge_values(values, own), preset="", title=title)
 
 
 def _sessions(
@@ -297,20 +250,6 @@ def _repeat(name: str, out: Path) -> dict[str, Any]:
     return _write(name, _rows(plan, result), result.runs, out)
 
 
-def table_1(
-    _data: Path | None, out: Path, names: Sequence[str] = tuple(name for name, _ in TABLE_1)
-) -> dict[str, Any]:
-    """Run the experiments with the parameters of the paper's Table 1, on the same frames."""
-    out, rows, runs = Path(out), list[dict[str, Any]](), list[SessionRun]()
-    for name in names:
-        plan = with_table_1(PLANS[name], dict(TABLE_1)[name])
-        result = run_plan(plan)
-        draw(plan, result, out, f"{name.replace('-', '_')}_")
-        rows += [{"experiment": name, **row} for row in _rows(plan, result)]
-        runs += result.runs
-    return _write("table-1", rows, runs, out)
-
-
 def virtual_tour(_data: Path | None, out: Path) -> dict[str, Any]:
     """Map an elliptic gallery in two sessions (paper's Figs. 9-11)."""
     return _repeat("virtual-tour", out)
@@ -324,11 +263,6 @@ def lab_tour(_data: Path | None, out: Path) -> dict[str, Any]:
 def five_sessions(_data: Path | None, out: Path) -> dict[str, Any]:
     """Map the blocks of a town in four sessions, and join them in a fifth (Figs. 15, 16)."""
     return _repeat("five-sessions", out)
-
-
-def five_sessions_apart(_data: Path | None, out: Path) -> dict[str, Any]:
-    """Map the blocks of a town in four sessions that share no pose, and join them in a fifth."""
-    return _repeat("five-sessions-apart", out)
 
 
 def campus(_data: Path | None, out: Path) -> dict[str, Any]:

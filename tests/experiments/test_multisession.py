@@ -85,30 +85,6 @@ def test_sessions_of_the_town_are_laps_of_a_block_each_and_the_outer_lap():
     assert np.ptp(truth[slice(*cuts[-1])], axis=0) == pytest.approx([68.0, 56.0], abs=0.1)
 
 
-def test_four_of_the_five_sessions_apart_share_no_pose_and_the_fifth_meets_each():
-    source = open_source(PLANS["five-sessions-apart"].source)
-    cuts, truth = PLANS["five-sessions-apart"].cuts(source), source.truths()
-    laps = [truth[slice(*cut)] for cut in cuts]
-    assert all(len(lap) > 600 for lap in laps)
-
-    def nearest_m(a, b):
-        apart = np.hypot(*(a[:, None, :2] - b[:, :2]).transpose(2, 0, 1))
-        turned = np.abs((a[:, None, 2] - b[:, 2] + np.pi) % (2 * np.pi) - np.pi)
-        return apart[turned < np.radians(45.0)].min()
-
-    cells_m = 2 * PLANS["five-sessions-apart"].config["pose_cells"]["cell_size_m"]
-    assert min(nearest_m(a, b) for k, a in enumerate(laps[:4]) for b in laps[:k]) > cells_m
-    assert max(nearest_m(lap, laps[4]) for lap in laps[:4]) < 0.5
-
-
-def test_table_1_replaces_all_but_what_belongs_to_the_camera_and_to_the_scale_of_the_world():
-    ours, printed = PLANS["lab-tour"], multisession.with_table_1(PLANS["lab-tour"], "lab_tour")
-    assert printed.config["odometry"] == ours.config["odometry"]
-    assert printed.config["pose_cells"]["cell_size_m"] == 0.5
-    assert printed.config["view"]["threshold"] == 0.04
-    assert printed.config["pose_cells"]["inject_energy"] == 0.5
-
-
 def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
     source = open_source(PLANS["campus"].source)
     cuts, truth = PLANS["campus"].cuts(source), source.truths()[:, 0]
