@@ -29,24 +29,27 @@ from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import SenseNoise, sense
 
 CONDITIONS: dict[str, dict[str, Any]] = {
-    "random weights, learns": {"development_steps": 0, "learns_online": True},
-    "developed weights, learns": {"learns_online": True},
-    "developed weights, fixed": {},
-    "random weights, fixed": {"development_steps": 0},
-    "random weights, learns as fast as in development": {
+    "random, learns": {"development_steps": 0, "learns_online": True},
+    "developed, learns": {"learns_online": True},
+    "developed, fixed": {},
+    "random, fixed": {"development_steps": 0},
+    "random, learns 100 x faster": {
         "development_steps": 0,
         "learns_online": True,
         "online_share": 1.0,
     },
 }
-"""Condition -> settings of ``grid_cells``; developed weights learnt at random positions before."""
+"""Weights at the start, and what they do -> settings of ``grid_cells``.
+
+Developed weights learnt at random positions before.
+"""
 
 _STYLES = {
-    "random weights, learns": (LOOP, "-"),
-    "developed weights, learns": (MAP, "-"),
-    "developed weights, fixed": (TRUTH, "--"),
-    "random weights, fixed": (ODOMETRY, ":"),
-    "random weights, learns as fast as in development": (CURVES[3], "-."),
+    "random, learns": (LOOP, "-"),
+    "developed, learns": (MAP, "-"),
+    "developed, fixed": (TRUTH, "--"),
+    "random, fixed": (ODOMETRY, ":"),
+    "random, learns 100 x faster": (CURVES[3], "-."),
 }
 _TIMES_S = (2.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0, 1200.0, 1500.0, 1800.0)
 _BIN_M, _SIDE_M = 0.025, 2.0

@@ -128,10 +128,10 @@ def test_grid_learning_is_scored_by_weights_and_by_the_path(rodent, tmp_path):
     assert (tmp_path / "grid_learning.png").is_file()
     weights = {(r["condition"], r["time_s"]): r["gridness_of_weights"] for r in result["rows"]}
     assert len(weights) == 2 * len(grid_learning.CONDITIONS)
-    fixed = weights["random weights, fixed", 2.0]
-    assert weights["random weights, fixed", 10.0] == fixed
-    assert weights["random weights, learns", 10.0] > fixed
-    assert weights["developed weights, fixed", 10.0] > 1.2
+    fixed = weights["random, fixed", 2.0]
+    assert weights["random, fixed", 10.0] == fixed
+    assert weights["random, learns", 10.0] > fixed
+    assert weights["developed, fixed", 10.0] > 1.2
 
 
 def test_boundary_cells_in_the_loop_are_run_with_feet_and_with_noisy_beams(rodent, tmp_path):
