@@ -26,7 +26,8 @@ _SURROUND = 2.0  # width of the inhibition over that of the tuning
 _CUT = 6.0  # half the size of a tuning kernel, in widths
 _ROUNDS = 4  # of the population vector
 _WINDOW = 5  # cells on either side that the population vector takes
-_SIDE_RAD = math.radians(40.0)  # beams on either side of a bearing that its cells take
+_SIDE_M = 0.2  # of a wall on either side of its foot, whose beams a cell takes
+_MOST_RAD = math.radians(75.0)  # angle to them at most
 _RINGS = (True, False)  # bearing, distance
 
 
@@ -351,10 +352,12 @@ class BoundarySheet(nn.Module):
     def respond_to_scan(self, ranges: np.ndarray) -> Tensor:
         r"""Return the responses to the beams of a scan, at bearings relative to the heading.
 
-        A cell sums all beams within 40 degrees of its bearing, each by the distance of its point
-        along that bearing, :math:`r \cos(\theta - \varphi_k)`, the integral of Hartley et al.
-        2000. A wall is felt on both sides of its foot, so that corners are none: the response is
-        the geometric mean of the two sides.
+        A cell sums the beams to the 0.2 m of a wall on either side of its foot, but none beyond 75
+        degrees, each by the distance of its point along the cell's bearing,
+        :math:`r \cos(\theta - \varphi_k)`, the integral of Hartley et al. 2000. So a near wall is
+        felt over a wide angle: its slanting beams tell the bearing, and their noise counts less,
+        by the cosine. A wall is felt on both sides of its foot, so that corners are none: the
+        response is the geometric mean of the two sides.
 
         Args:
             ranges: As for :func:`~neuroslam.sensors.scan.walls_in_scan`, ``(n,)``.
@@ -371,21 +374,22 @@ class BoundarySheet(nn.Module):
     def _rasterise(self, ranges: np.ndarray) -> np.ndarray:
         n, c = len(ranges), self.config
         bins, cells = c.sheet_bearings, len(self.warped_m)
-        top = float(self.warped_m[-1])
-        farthest = c.beta_m * math.expm1(top / c.beta_m) / math.cos(_SIDE_RAD)
-        used = np.flatnonzero(ranges < farthest)
+        farthest = c.beta_m * math.expm1(float(self.warped_m[-1]) / c.beta_m)
+        used = np.flatnonzero(ranges < math.hypot(farthest, _SIDE_M))
         theta = used * (TWO_PI / n)
-        reach = int(_SIDE_RAD * bins / TWO_PI)
+        reach = int(_MOST_RAD * bins / TWO_PI)
         nearest = np.rint(theta * (bins / TWO_PI)).astype(np.int64)
         k = nearest[:, None] + np.arange(-reach, reach + 1)
         apart = theta[:, None] - k * (TWO_PI / bins)
-        at = c.beta_m * np.log1p(ranges[used, None] * np.cos(apart) / c.beta_m)
+        distance_m = ranges[used, None] * np.cos(apart)
+        side_rad = np.minimum(np.arctan2(_SIDE_M, distance_m), _MOST_RAD)
+        at = c.beta_m * np.log1p(distance_m / c.beta_m)
         at = (at - float(self.warped_m[0])) / self.step_m
         low = np.floor(at).astype(np.int64)
         share = at - low
         flat = (k % bins) * cells + low
         sides = np.zeros((2, bins * cells))
-        each = (TWO_PI / n) / (reach * TWO_PI / bins)
+        each = (np.abs(apart) <= side_rad) * (TWO_PI / n) / side_rad
         for side, sign in enumerate((1.0, -1.0)):
             weight = each * (0.5 + 0.5 * np.sign(np.where(np.abs(apart) < 1e-9, 0, sign * apart)))
             for cell, part in ((0, 1.0 - share), (1, share)):

@@ -163,14 +163,61 @@ def rates_step(
             rates[m, i] = max(drive + ((a + b) + (c + d)) - bias[m, i], np.float32(0.0))
 
 
+@compiled
+def learn_step(
+    phases: np.ndarray, feedforward: np.ndarray, lateral: np.ndarray, threshold: np.ndarray,
+    bias: np.ndarray, numbers: np.ndarray,
+) -> None:  # fmt: skip
+    """Learn from the phases of one animal at settled rates by :func:`lahn_learn`, in place.
+
+    ``numbers`` are the rates of learning of the weights, the inhibition and the thresholds, the
+    sparseness and the silent fraction.
+    """
+    n_modules, n_cells, n_inputs = feedforward.shape
+    hebb, anti, slow, sparse, silent = numbers
+    x = np.empty(n_inputs, np.float32)
+    onto, rates, s = (
+        np.empty(n_cells, np.float32), np.empty(n_cells, np.float32), np.empty(n_cells, np.float32)
+    )  # fmt: skip
+    for m in range(n_modules):
+        for k in range(n_inputs):
+            x[k] = phases[m, k // 2, k % 2]
+        for i in range(n_cells):
+            drive = np.float32(0.0)
+            for k in range(n_inputs):
+                drive += feedforward[m, i, k] * x[k]
+            onto[i], rates[i] = drive, max(drive - bias[m, i], np.float32(0.0))
+        for i in range(n_cells):
+            drive = onto[i]
+            for k in range(n_cells):
+                drive += lateral[m, i, k] * rates[k]
+            above = max(drive - threshold[m, i], np.float32(0.0))
+            s[i] = above * above
+            fires = np.float32(1.0 if drive > bias[m, i] else 0.0)
+            threshold[m, i] += slow * (s[i] - sparse)
+            bias[m, i] += slow * (fires - (np.float32(1.0) - silent))
+        for i in range(n_cells):
+            square = np.float32(0.0)
+            for k in range(n_inputs):
+                feedforward[m, i, k] += hebb * s[i] * (x[k] - onto[i] * feedforward[m, i, k])
+                square += feedforward[m, i, k] * feedforward[m, i, k]
+            norm = np.float32(math.sqrt(square))
+            for k in range(n_inputs):
+                feedforward[m, i, k] /= norm
+            for k in range(n_cells):
+                less = lateral[m, i, k] - anti * (s[i] * s[k] - sparse * sparse)
+                lateral[m, i, k] = np.float32(0.0) if k == i else min(less, np.float32(0.0))
+
+
 class LAHNGridCells(BufferModule):
     """Modules of grid cells that learn, without a teacher, from the phases of oscillators.
 
     :func:`lahn_drive`, :func:`lateral_kernel` and :func:`lahn_learn` have the mathematics. A
-    network is made with weights that developed at random positions, without an environment;
-    ``learn`` continues from there. State: the parameters ``feedforward`` and ``lateral``, the
-    buffers ``threshold``, ``bias`` and ``rates``, and the generator of its random weights. Animals
-    of a batch share one network.
+    network is made with weights that developed at random positions, without an environment; with
+    ``learns_online`` it continues while the animal moves, by smaller steps: positions in a row are
+    alike, and steps as large as those of development let the fields wander. State: the parameters
+    ``feedforward`` and ``lateral``, the buffers ``threshold``, ``bias`` and ``rates``, and the
+    generator of its random weights. Animals of a batch share one network.
 
     Args:
         config: Modules, cells, learning rates.
@@ -194,6 +241,13 @@ class LAHNGridCells(BufferModule):
         super().__init__()
         self.config = config
         self.batch = batch
+        rates = ("hebbian_rate", "lateral_rate", "threshold_rate")
+        slower = {name: config.online_share * getattr(config, name) for name in rates}
+        self._online = c = config.model_copy(update=slower)
+        self._numbers = np.array(
+            [c.hebbian_rate, c.lateral_rate, c.threshold_rate, c.sparseness, c.silent_fraction],
+            np.float32,
+        )
         m, n, inputs = len(config.spacings_m), config.n_cells, 2 * config.directions
         generator = torch.Generator().manual_seed(config.seed)
         start = torch.randn(m, n, inputs, generator=generator)
@@ -257,12 +311,17 @@ class LAHNGridCells(BufferModule):
         self.generator_state = generator.get_state()
 
     @torch.no_grad()
-    def learn(self, inputs: Tensor) -> None:
-        """Learn from inputs, ``(samples, n_modules, 2 * directions)``, at settled rates."""
+    def learn(self, inputs: Tensor, config: GridCellConfig | None = None) -> None:
+        """Learn from inputs at settled rates.
+
+        Args:
+            inputs: ``(samples, n_modules, 2 * directions)``.
+            config: Learning rates; ``None``: those of development.
+        """
         q, _, _, bias = self.weights
         rates = (inputs.unsqueeze(-2) @ q.mT).squeeze(-2).sub(bias).clamp_min(0.0)
         drive = lahn_drive(inputs, rates, q, self.coupling)
-        learnt = lahn_learn(inputs, drive, self.weights, self.config)
+        learnt = lahn_learn(inputs, drive, self.weights, config or self.config)
         self.feedforward.copy_(learnt.feedforward)
         if self.config.lateral != "kernel":
             self.lateral.copy_(learnt.lateral)
@@ -283,15 +342,19 @@ class LAHNGridCells(BufferModule):
         self.rates = rates.detach()
         if self.config.learns_online:
             with torch.no_grad():
-                self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]))
+                self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]), self._online)
         return rates
 
     def rates_compiled(self, phases: np.ndarray) -> np.ndarray:
         """Do as :meth:`forward` for one animal, in place."""
-        feedforward, lateral, _, bias, rates, *_ = cast(Arrays, self.arrays())
-        if self.config.lateral != "learned":
+        feedforward, lateral, threshold, bias, rates, *_ = cast(Arrays, self.arrays())
+        is_learnt = self.config.lateral == "learned"
+        if not is_learnt:
             lateral = self.coupling.detach().contiguous().numpy()
         rates_step(phases, feedforward, lateral, bias, rates)
-        if self.config.learns_online:
-            self.learn(torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)[None])
+        if self.config.learns_online and is_learnt:
+            learn_step(phases, feedforward, lateral, threshold, bias, self._numbers)
+        elif self.config.learns_online:
+            inputs = torch.from_numpy(phases).flatten(-2).to(self.bias.dtype)
+            self.learn(inputs[None], self._online)
         return rates

@@ -124,6 +124,7 @@ class NavigationCells(Population):
         *,
         compass: bool = True,
         read: bool = False,
+        sensed: bool = True,
     ) -> NavigationEstimate:
         """Advance by one step of motion, and correct by the walls at its end.
 
@@ -136,6 +137,7 @@ class NavigationCells(Population):
             wall_bearing_rad: Its bearing relative to the heading, the same shape.
             compass: Whether the heading is measured; else it is integrated from turn rates.
             read: Whether the walls were read from the sheet of boundary cells already.
+            sensed: Whether walls were looked for; if not, none is no evidence that none is there.
 
         Raises:
             BadFrame: If a number is not finite or a distance negative; nothing has changed then.
@@ -147,7 +149,7 @@ class NavigationCells(Population):
             felt_m = np.ascontiguousarray(wall_m.numpy(), np.float64)
             felt_rad = np.ascontiguousarray(wall_bearing_rad.numpy(), np.float64)
             speed, heading = float(speed_m_s), float(heading_rad)
-            return self._step(speed, heading, dt_s, felt_m, felt_rad, compass, read)
+            return self._step(speed, heading, dt_s, felt_m, felt_rad, compass, read, sensed)
         bearing = wall_bearing_rad + heading_rad.unsqueeze(-1)
         total = float((speed_m_s + heading_rad + bearing.sum(-1)).sum())
         nearest = float(wall_m.min()) if wall_m.numel() else math.inf
@@ -174,8 +176,8 @@ class NavigationCells(Population):
             step = step + correction
         grid = self.grid(oscillators.shift(step))
         place = self.place(grid.flatten(-2), oscillators.position_m, dt_s, learns=learns)
-        now.since_s += dt_s
-        if now.since_s >= FAMILIARITY_PERIOD_S:
+        now.since_s = _since(now.since_s + dt_s, sensed)
+        if sensed and now.since_s >= FAMILIARITY_PERIOD_S:
             x, felt_m, felt_rad = oscillators.position_m, wall_m, bearing - memory.errors[:, 1:]
             if self.batch is None:
                 x, felt_m, felt_rad = x[None], felt_m[None], felt_rad.reshape(1, -1)
@@ -208,6 +210,7 @@ class NavigationCells(Population):
         wall_bearing_rad: np.ndarray,
         compass: bool,
         read: bool = False,
+        sensed: bool = True,
     ) -> NavigationEstimate:
         """Do as :meth:`forward` for one animal by compiled steps."""
         boundary, memory, oscillators = self.boundary, self.walls, self.oscillators
@@ -218,8 +221,8 @@ class NavigationCells(Population):
         now, corrects = self.now, self.config.wall_memory.corrects
         learns = not (now.someone_lost and familiarity.is_lost)
         dx, dy = memory.move_compiled(speed_m_s, heading_rad, dt_s)
-        since_s = now.since_s + dt_s
-        compares = since_s >= FAMILIARITY_PERIOD_S
+        since_s = _since(now.since_s + dt_s, sensed)
+        compares = sensed and since_s >= FAMILIARITY_PERIOD_S
         corrects_now = corrects and nearest < math.inf and memory.is_due
         if self._senses and not read and nearest < math.inf and (compares or corrects_now):
             wall_m, bearing = self._read_sheet(wall_m, bearing)
@@ -291,7 +294,8 @@ class NavigationCells(Population):
         Args:
             motion: Since the last frame.
             compass_rad: Measured heading; ``None``: it is integrated from the turns.
-            walls: Distance (m) and bearing relative to the heading (rad) of each, ``(n, 2)``.
+            walls: Distance (m) and bearing relative to the heading (rad) of each, ``(n, 2)``;
+                ``None``: not looked for.
 
         Raises:
             BadFrame: If a number is invalid; nothing has changed then.
@@ -302,7 +306,7 @@ class NavigationCells(Population):
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
     ) -> NavigationEstimate:
         """Do as :meth:`advance` by walls that were checked."""
-        now, compass = self.now, compass_rad is not None
+        now, compass, sensed = self.now, compass_rad is not None, walls is not None
         if compass_rad is not None:
             heading = wrap_angle(checked_number(compass_rad, "heading", "rad") + now.turned_rad)
         else:
@@ -312,14 +316,16 @@ class NavigationCells(Population):
         if self._compiles():
             _check_duration(motion.dt_s)
             with torch.inference_mode():
-                here = self._step(motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass)
+                here = self._step(
+                    motion.v_m_s, heading, motion.dt_s, wall_m, bearing, compass, sensed=sensed
+                )
         else:
             columns = ([motion.v_m_s, heading], wall_m, bearing)
             device = self.walls.errors.device
             (speed, course), *felt_walls = (
                 torch.as_tensor(column, dtype=torch.float64, device=device) for column in columns
             )
-            here = self(speed, course, motion.dt_s, *felt_walls, compass=compass)
+            here = self(speed, course, motion.dt_s, *felt_walls, compass=compass, sensed=sensed)
         now.heading_rad, now.compass = heading, int(compass)
         return here
 
@@ -552,3 +558,13 @@ class NavigationCells(Population):
 def _check_duration(dt_s: float) -> None:
     if not 0.0 <= dt_s < math.inf:  # NaN too
         raise BadFrame(f"time since the last step is {dt_s} s; expected 0 or more")
+
+
+def _since(since_s: float, sensed: bool) -> float:
+    """Return the time since the last comparison; without sensing it counts as one period at most.
+
+    Example:
+        >>> _since(0.55, True), _since(60.0, False)
+        (0.55, 0.5)
+    """
+    return since_s if sensed else min(since_s, FAMILIARITY_PERIOD_S)

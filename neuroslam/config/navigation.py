@@ -80,7 +80,7 @@ class BoundaryCellConfig(Section):
         "beside strong ones are suppressed",
     )
     sheet_share: float = Field(
-        default=0.3,
+        default=0.5,
         gt=0,
         lt=1,
         description="response of a local maximum that is read as a wall, as a share of that to one "
@@ -182,6 +182,13 @@ class GridCellConfig(Section):
     )
     learns_online: bool = Field(
         default=False, description="continue learning while the animal moves"
+    )
+    online_share: float = Field(
+        default=0.01,
+        gt=0,
+        le=1,
+        description="learning rates while the animal moves, as a share of those of development, "
+        "which average over 64 independent positions; larger: learns sooner, but fields wander",
     )
     seed: int = Field(
         default=0,

@@ -35,6 +35,7 @@ EXPERIMENTS = {
     "head-direction": ("neuroslam.experiments.head_direction", "head_direction", None),
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
+    "grid-learning": ("neuroslam.experiments.grid_learning", "grid_learning", "rodent"),
     "place-map": ("neuroslam.experiments.place_cells", "place_map", "rodent"),
     "place-bump": ("neuroslam.experiments.place_bump", "place_bump", "rodent"),
     "semantic-maps": ("neuroslam.experiments.semantic_maps", "semantic_maps", None),

@@ -1,6 +1,7 @@
 """Common parts of the experiments with rats: tracks, simulation of navigation cells, errors."""
 
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import torch
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
-from neuroslam.errors import MapError
+from neuroslam.errors import ConfigError, MapError
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.worlds.arena import Arena
 from neuroslam.worlds.rodent import Walk, read_walk
@@ -25,7 +26,11 @@ TRACKS = {
 }
 """Name -> recording: RatInABox agents in polygons, and two real rats in circles."""
 
+RECTANGLE = "tanni"
+"""A rat in a rectangle of 2.5 x 3.5 m (Tanni et al. 2022), which RatInABox brings along."""
+
 RATE_HZ = 20.0
+_EDGE_M = 0.01  # nearest that a rat comes to the wall of the rectangle
 WALLS = 2  # that an animal senses at once, at most: those of a corner
 
 Hook = Callable[[int, NavigationEstimate, NavigationCells], object]
@@ -76,15 +81,36 @@ class Errors(NamedTuple):
 
 
 def read_track(data: Path, name: str, minutes: float = 30.0) -> Walk:
-    """Read one of ``TRACKS`` at 20 Hz; a recording that is too short is run to and fro.
+    """Read one of ``TRACKS``, or ``RECTANGLE``, at 20 Hz; a short recording is run to and fro.
 
     Args:
         data: Folder of the recordings.
         name: Name of the track.
         minutes: Duration; at most that of the recording for ``sargolini``.
+
+    Raises:
+        ConfigError: If RatInABox, which has the recording ``RECTANGLE``, is not installed.
     """
+    if name == RECTANGLE:
+        return _rat_in_a_rectangle().lasting(minutes)
     walk = read_walk(data / TRACKS[name], rate_hz=RATE_HZ)
     return walk.lasting(min(minutes, walk.duration_s / 60) if name == "sargolini" else minutes)
+
+
+def has_rectangle() -> bool:
+    """Return whether the recording ``RECTANGLE`` is installed, with the extra ``rodent``."""
+    return find_spec("ratinabox") is not None
+
+
+def _rat_in_a_rectangle() -> Walk:
+    found = find_spec("ratinabox")
+    if found is None or found.origin is None:
+        raise ConfigError(f"{RECTANGLE}: comes with RatInABox; pip install neuroslam[rodent]")
+    walk = read_walk(Path(found.origin).parent / "data" / f"{RECTANGLE}.npz", rate_hz=RATE_HZ)
+    # Of a camera above: the head leans over the wall by up to 4 cm.
+    inside = walk.positions.clip([_EDGE_M, _EDGE_M], [3.5 - _EDGE_M, 2.5 - _EDGE_M])
+    arena = Arena([(0.0, 0.0), (3.5, 0.0), (3.5, 2.5), (0.0, 2.5)], name=RECTANGLE)
+    return Walk.along(RECTANGLE, walk.times_s, inside, arena)
 
 
 def simulate(
@@ -130,6 +156,31 @@ def run_cells(senses: Senses, config: BrainConfig, hook: Hook) -> NavigationCell
         for i, dt_s in enumerate(senses.dt_s.tolist()):
             speed, heading, wall, bearing = (column[i] for column in columns)
             hook(i, cells(speed, heading, dt_s, wall, bearing), cells)
+    return cells
+
+
+def run_one(
+    senses: Senses, animal: int, config: BrainConfig, hook: Hook, every: int = 1
+) -> NavigationCells:
+    """Run the cells of one animal of several, by compiled steps; return them in their final state.
+
+    Args:
+        senses: Sensor data.
+        animal: Its row.
+        config: Of the brain.
+        hook: Called after every step.
+        every: Walls are looked for at every ``every``-th step, not at the others.
+    """
+    cells = NavigationCells(config)
+    columns = [
+        torch.from_numpy(np.ascontiguousarray(column[animal]))
+        for column in (senses.speed_m_s, senses.heading_rad, senses.wall_m, senses.wall_bearing_rad)
+    ]
+    with torch.inference_mode():
+        for i, (dt_s, *felt) in enumerate(zip(senses.dt_s.tolist(), *columns, strict=True)):
+            speed, heading, wall, bearing = felt
+            sensed = (i + 1) % every == 0
+            hook(i, cells(speed, heading, dt_s, wall, bearing, sensed=sensed), cells)
     return cells
 
 

@@ -16,6 +16,7 @@ import torch
 from neuroslam.cells.boundary import ATTENUATION, GROWTH, INHIBITION, BoundaryCells, boundary_zone
 from neuroslam.config import BoundaryCellConfig
 from neuroslam.evaluation.ratemap import Bins, rate_map
+from neuroslam.figures.boundary_cells import ActiveCells, plot_active_cells
 from neuroslam.figures.cells import Approach, Firing, plot_approaches, plot_firing_maps
 from neuroslam.figures.style import save
 from neuroslam.state.files import write_atomically
@@ -28,6 +29,7 @@ FIRES = 0.1
 """Rate above which a cell counts as firing; the largest rate is 1."""
 
 _BIN_M = 0.04
+_SHOWN_M = (0.2, 0.1, 0.03)  # distances to the wall at which the active cells are drawn
 
 _CORNER = 0.975
 _CURVE = 0.5, math.sqrt(0.975**2 - 0.5**2)  # y of the path; x at 2.5 cm from the wall
@@ -63,7 +65,8 @@ def boundary_scenarios(
 
     Args:
         data_folder: Not used.
-        out_folder: ``results.json``, ``scenarios.png`` and ``firing_maps.png`` are written there.
+        out_folder: ``results.json``, ``scenarios.png``, ``active_cells.png`` and
+            ``firing_maps.png`` are written there.
         minutes: Length of the walks for the rate maps.
 
     Returns:
@@ -73,6 +76,12 @@ def boundary_scenarios(
     approaches = [walk_straight(scenario) for scenario in SCENARIOS]
     title = f"Boundary cells on paths towards and away from walls, at {SPEED_M_S:g} m/s"
     save(plot_approaches(approaches, title), out / "scenarios.png")
+    cells = BoundaryCells(BoundaryCellConfig())
+    bearings, distances = cells.preferred_rad.numpy(), cells.preferred_m.numpy()
+    active = [active_cells(scenario) for scenario in SCENARIOS]
+    title = "Boundary cells by preferred bearing and distance, along the paths"
+    figure = plot_active_cells(active, bearings, distances, FIRES, title)
+    save(figure, out / "active_cells.png")
     maps = [map_firing(name, minutes) for name in ("square", "circle2m")]
     title = f"Rate maps of four boundary cells over {minutes:g} minutes"
     save(plot_firing_maps(maps, title, "mean rate (1 at most)"), out / "firing_maps.png")
@@ -94,14 +103,18 @@ def boundary_scenarios(
 
 def walk_straight(scenario: Scenario, config: BoundaryCellConfig | None = None) -> Approach:
     """Follow the path of a scenario without noise, from rest, and record the boundary cells."""
-    config = config or BoundaryCellConfig()
+    return _approach(scenario, config or BoundaryCellConfig())[0]
+
+
+def _approach(scenario: Scenario, config: BoundaryCellConfig) -> tuple[Approach, np.ndarray]:
+    """Return the path of a scenario, and the rates of all cells along it."""
     start, end = np.array(scenario.start_m), np.array(scenario.end_m)
     n = 1 + round(float(np.hypot(*(end - start))) / SPEED_M_S * RATE_HZ)
     path = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
     arena = named_arena(scenario.arena)
     activity, rates = respond(*arena.walls_near(path, math.inf), 1.0 / RATE_HZ, config)
     distance = arena.clearance(path)
-    return Approach(
+    found = Approach(
         f"{scenario.letter}: {scenario.motion}",
         arena,
         path,
@@ -112,6 +125,15 @@ def walk_straight(scenario: Scenario, config: BoundaryCellConfig | None = None) 
         (rates > FIRES).mean(axis=(1, 2)),
         rates.max(axis=-1),
     )
+    return found, rates
+
+
+def active_cells(scenario: Scenario) -> ActiveCells:
+    """Return the rates of all cells at some distances from the wall, in the order of the path."""
+    approach, rates = _approach(scenario, BoundaryCellConfig())
+    steps = sorted(int(np.abs(approach.distance_m - at).argmin()) for at in _SHOWN_M)
+    moments = tuple(f"{100.0 * approach.distance_m[i]:.0f} cm" for i in steps)
+    return ActiveCells(scenario.letter, moments, rates[steps])
 
 
 def respond(

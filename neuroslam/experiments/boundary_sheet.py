@@ -12,12 +12,14 @@ from neuroslam.cells.boundary_sheet import BoundarySheet
 from neuroslam.config import BoundaryCellConfig, BrainConfig
 from neuroslam.experiments.animals import (
     RATE_HZ,
+    RECTANGLE,
     TRACKS,
     WALLS,
     arena_of,
+    has_rectangle,
     position_errors,
     read_track,
-    run_cells,
+    run_one,
 )
 from neuroslam.experiments.boundary_cells import write_results
 from neuroslam.figures.place_errors import plot_errors
@@ -32,6 +34,8 @@ BEAM_SIGMA_M = 0.03
 OUTLIERS = 0.1
 SCAN_EVERY = round(0.25 * RATE_HZ)
 """Steps between two scans: the period of the corrections by walls."""
+
+_MAIN = ("raw walls", "boundary cells")
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "raw walls": {},
@@ -54,8 +58,8 @@ def boundary_cells_in_loop(
     out_folder: Path,
     minutes: float = 30.0,
     seeds: Sequence[int] = range(10),
-    beam_seeds: Sequence[int] = range(3),
-    tracks: Sequence[str] = tuple(TRACKS),
+    few_seeds: Sequence[int] = range(3),
+    tracks: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Compare positions with raw walls, with boundary cells, and with the cells impaired.
 
@@ -64,33 +68,33 @@ def boundary_cells_in_loop(
         out_folder: ``results.json``, ``feet.png`` and ``noisy_beams.png`` are written there.
         minutes: Length of a walk.
         seeds: Seed of the noise of each animal.
-        beam_seeds: The same for walks with noisy beams, which take longer.
-        tracks: Names of tracks.
+        few_seeds: The same for walks with noisy beams, and with impaired cells.
+        tracks: Names of tracks; ``None``: all of ``TRACKS``, and ``RECTANGLE`` if it is installed.
 
     Returns:
         The content of ``results.json``: ``rows``, one for each track, input and condition.
     """
     out, rows = Path(out_folder), []
+    if tracks is None:
+        tracks = (*TRACKS, RECTANGLE) if has_rectangle() else tuple(TRACKS)
     for name in tracks:
         walk = read_track(Path(data_folder), name, minutes)
-        feet = sense(walk, SenseNoise(), seeds, k=WALLS)
         for condition in CONDITIONS:
+            feet = sense(walk, SenseNoise(), seeds if condition in _MAIN else few_seeds, k=WALLS)
             rows.append({"track": name, "input": "feet", **run(feet, walk, condition)})
-        motion = sense(walk, SenseNoise(), beam_seeds, k=WALLS)
-        scans = noisy_scans(walk, beam_seeds)
-        for condition in ("raw walls", "boundary cells"):
+        motion = sense(walk, SenseNoise(), few_seeds, k=WALLS)
+        scans = noisy_scans(walk, few_seeds)
+        for condition in _MAIN:
             felt = with_scans(motion, scans, condition)
-            rows.append({"track": name, "input": "noisy beams", **run(felt, walk, condition)})
+            row = run(felt, walk, condition, SCAN_EVERY)
+            rows.append({"track": name, "input": "noisy beams", **row})
     for kind in ("feet", "noisy beams"):
-        errors = {
-            condition: {
-                row["track"]: np.array(row["errors_m"])
-                for row in rows
-                if row["input"] == kind and row["condition"] == condition
-            }
-            for condition in CONDITIONS
-        }
-        errors = {condition: values for condition, values in errors.items() if values}
+        few = len(few_seeds) if kind == "feet" else None  # the same seeds for all conditions
+        errors: dict[str, dict[str, np.ndarray]] = {}
+        for row in rows:
+            if row["input"] == kind:
+                own = errors.setdefault(row["condition"], {})
+                own[row["track"]] = np.array(row["errors_m"][:few])
         title = f"Boundary cells in the loop: walls as {kind}, {minutes:g} min"
         colours = dict(zip(CONDITIONS, CURVES, strict=False))
         figure = plot_errors(errors, title=title, colours=colours)
@@ -98,26 +102,35 @@ def boundary_cells_in_loop(
     return write_results(out, {"experiment": "boundary-cells", "minutes": minutes, "rows": rows})
 
 
-def run(senses: Senses, walk: Walk, condition: str) -> dict[str, Any]:
-    """Run animals under a condition and return their errors in metres."""
-    estimate = np.empty((len(senses.time_s), len(senses.speed_m_s), 2))
+def run(senses: Senses, walk: Walk, condition: str, every: int = 1) -> dict[str, Any]:
+    """Run animals under a condition and return their errors in metres.
 
-    def note(i: int, here: Any, cells: Any) -> None:  # noqa: ANN401 - a hook
-        estimate[i] = here.position_m.numpy()
-
-    began = time.perf_counter()
+    Args:
+        senses: Sensor data of the animals.
+        walk: The true motion.
+        condition: One of ``CONDITIONS``.
+        every: Steps from one look at the walls to the next.
+    """
     config = BrainConfig.model_validate(CONDITIONS[condition])
-    cells = run_cells(senses, config, note)
-    each_ms = 1e3 * (time.perf_counter() - began) / len(senses.time_s)
-    errors = position_errors(np.moveaxis(estimate, 1, 0) + walk.positions[0], walk.positions)
+    animals, steps = senses.speed_m_s.shape
+    estimate, lost_s, began = np.empty((animals, steps, 2)), np.empty(animals), time.process_time()
+    for animal in range(animals):
+        own = estimate[animal]
+
+        def note(i: int, here: Any, _cells: Any, own: np.ndarray = own) -> None:  # noqa: ANN401
+            own[i] = here.position_m.numpy()
+
+        lost_s[animal] = run_one(senses, animal, config, note, every).now.lost_s
+    each_ms = 1e3 * (time.process_time() - began) / (animals * steps)
+    errors = position_errors(estimate + walk.positions[0], walk.positions)
     return {
         "condition": condition,
         "error_m": float(errors.mean_m.mean()),
         "errors_m": errors.mean_m.tolist(),
         "error_sd_m": float(errors.mean_m.std()),
         "ate_m": float(errors.aligned_m.mean()),
-        "place_cells": float(cells.place.n_cells.double().mean()),
-        "batch_step_ms": each_ms,
+        "lost_s": float(lost_s.mean()),
+        "step_cpu_ms": each_ms,
     }
 
 

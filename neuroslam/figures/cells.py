@@ -365,7 +365,8 @@ def plot_scores(panels: Mapping[str, Mapping[str, Curve]], time_label: str, titl
             write_title(ax, name)
         for ax in axes[:, 0]:
             ax.set_ylabel("grid score (-2 to 2)")
-        columns = len(key) if len(key) < 6 else 4
+        wide = axes.shape[1]
+        columns = len(key) if len(key) < 2 * wide else wide + 1
         figure.legend(handles=list(key.values()), loc="outside lower center", ncols=columns)
     return figure
 

@@ -129,7 +129,7 @@ def planned_path(run: FinishedRun) -> tuple[list[int], str]:
     length_m = float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum())
     return path, (
         f"Planned path: from experience {path[0]} to {path[-1]}, {counted(len(steps), 'link')}, "
-        f"{length_m:.1f} {length_unit(run.out / 'brain.safetensors')}."
+        f"{length_m:.1f} {_unit(run)}."
     )
 
 

@@ -1,4 +1,7 @@
-"""Offset between the clocks of a camera and of a source of motion, from their turn rates."""
+"""Joint initialisation of a camera, a source of motion and a compass: clocks and scales.
+
+Their turn rates show the offsets of their clocks, and how visual odometry must be scaled.
+"""
 
 import math
 from typing import NamedTuple
@@ -32,11 +35,22 @@ _APART_S = 1.0
 """Offsets nearer than this to each other are one."""
 
 
+_FIRST_S = 600.0
+"""Of the camera's recording, which takes long to read: offset and scales do not change."""
+
+_WINDOW_S = 1.0
+"""Motion is compared over windows of this duration, which average single measurements."""
+
+
 class Turns(NamedTuple):
-    """Turning of a recording: ``turned_rad[k]`` from ``times_s[k]`` to ``times_s[k + 1]``."""
+    """Motion of a recording: ``turned_rad[k]`` from ``times_s[k]`` to ``times_s[k + 1]``.
+
+    ``moved_m`` is the distance in the same intervals; empty where it is not measured.
+    """
 
     times_s: np.ndarray
     turned_rad: np.ndarray
+    moved_m: np.ndarray = np.zeros(0)
 
 
 class Offset(NamedTuple):
@@ -51,6 +65,22 @@ class Offset(NamedTuple):
     offset_s: float
     correlation: float
     overlap_s: float
+
+
+class JointStart(NamedTuple):
+    """What the first minutes show about a camera, a source of motion and a compass.
+
+    Attributes:
+        offset: Of the clock of the motion to that of the camera.
+        turn_scale: Turning by visual odometry over the measured turning; NaN if nothing turned.
+        speed_scale: Distance by visual odometry over the measured distance; NaN if unknown.
+        compass: Offset of the compass to the motion; ``None`` without one, or if it is not found.
+    """
+
+    offset: Offset
+    turn_scale: float
+    speed_scale: float
+    compass: Offset | None
 
 
 def resolve_offset(
@@ -79,30 +109,71 @@ def resolve_offset(
             raise SourceError(f"--offset {offset}: expected a number of seconds, or auto")
         return with_offset(spec, repr(offset_s)), ()
     with_offset(spec, 0.0)  # two sources, without an offset
-    found = find_offset(spec, config)
+    start = find_joint_start(spec, config)
+    found, fov_deg = start.offset, config.odometry.fov_deg
     note = (
         f"offset {time_text(found.offset_s)}: added to the times of the motion; the turn rates "
         f"correlate by {found.correlation:.2f} over {time_text(round(found.overlap_s, 2))}"
     )
-    return with_offset(spec, repr(round(found.offset_s, 6))), (note,)
+    notes = [note]
+    if start.turn_scale > 0.0:
+        notes.append(
+            f"scale: visual odometry turns by {start.turn_scale:.2f} of the measured turns; with "
+            f"odometry.fov_deg {fov_deg / start.turn_scale:.1f} in place of {fov_deg:g} by as much"
+        )
+    if start.speed_scale > 0.0:
+        notes.append(
+            f"scale: visual odometry measures {start.speed_scale:.3g} m per metre; with "
+            "odometry.speed_scaling_m_s "
+            f"{config.odometry.speed_scaling_m_s / start.speed_scale:.3g} it measures metres"
+        )
+    if start.compass is not None:
+        notes.append(
+            f"compass: {time_text(round(start.compass.offset_s, 3))} to add to its times; its "
+            f"turns correlate with those of the motion by {start.compass.correlation:.2f}"
+        )
+    return with_offset(spec, repr(round(found.offset_s, 6))), tuple(notes)
 
 
-def find_offset(spec: str, config: BrainConfig) -> Offset:
-    """Find the offset between the clocks of a camera and of a source of motion.
+def find_joint_start(spec: str, config: BrainConfig) -> JointStart:
+    """Find the offset between the clocks of a camera and of a source of motion, and the scales.
 
-    Visual odometry measures the turn rates of the camera; see :func:`best_offset`.
+    See :func:`joint_start`.
 
     Raises:
-        SourceError: If a source cannot be opened, or one is live.
-        RunError: If the turn rates do not agree at any offset, or as well at another.
+        SourceError: If a source cannot be opened.
+        RunError: If one is live, or the turn rates do not agree at any offset, or as well at
+            another.
     """
     parts = pair_of(spec)
     if parts is None:
         raise SourceError(f"{spec}: is one source; expected a camera and motion")
-    sources = [open_source(part, config.frame_rate_hz, config.view.grey) for part in parts]
-    if any(source.live for source in sources):
+    camera, motion = (open_source(part, config.frame_rate_hz, config.view.grey) for part in parts)
+    if camera.live or motion.live:
         raise RunError(f"{spec}: is live; --offset auto reads its sources twice; give seconds")
-    camera, motion = sources
+    try:
+        return joint_start(camera, motion, config)
+    except SourceError:
+        raise
+    except ValueError as error:
+        raise RunError(f"{spec}: {error}; give --offset S in seconds") from None
+
+
+def joint_start(camera: Source, motion: Source, config: BrainConfig) -> JointStart:
+    """Find offsets of clocks and scales of a camera, a source of motion and its compass.
+
+    Visual odometry measures the motion of the camera in its first ten minutes; see
+    :func:`best_offset` and :func:`scale_of`. A compass whose turns agree with those of the motion
+    has an offset too, as by the lag of a filter.
+
+    Args:
+        camera: A source of images; if it has none, the two are exchanged.
+        motion: A source of motion, with or without a compass.
+        config: Visual odometry, frames per second.
+
+    Raises:
+        ValueError: If the turn rates do not agree at any offset, or as well at another.
+    """
     first = next(camera.frames(on_bad_frame=lambda _: None), None)
     if first is not None and first.image is None:
         camera, motion = motion, camera
@@ -110,14 +181,66 @@ def find_offset(spec: str, config: BrainConfig) -> Offset:
     measured = _measured(motion)
     for source, turns in ((camera, seen), (motion, measured)):
         if len(turns.turned_rad) < 10:
-            raise RunError(
+            raise ValueError(
                 f"{source.name}: {counted(len(turns.turned_rad), 'turn rate')}; expected at least "
-                "10 for --offset auto; give seconds"
+                "10 to find the offset"
             )
+    offset = best_offset(seen, measured)
+    turn_scale = scale_of(seen, measured, offset.offset_s)
+    speed_scale = scale_of(seen, measured, offset.offset_s, "moved_m")
+    return JointStart(offset, turn_scale, speed_scale, _compass_offset(motion, measured))
+
+
+def scale_of(seen: Turns, measured: Turns, offset_s: float, of: str = "turned_rad") -> float:
+    r"""Return the motion that a camera sees as a multiple of the measured motion.
+
+    .. math:: k = \frac{\sum_i c_i m_i}{\sum_i m_i^2}
+
+    over windows of a second, so that noise of visual odometry does not bias it.
+
+    Args:
+        seen: Motion seen by the camera.
+        measured: Motion by its source.
+        offset_s: Seconds to add to the times of the motion.
+        of: ``turned_rad`` or ``moved_m``.
+
+    Returns:
+        The scale; NaN without common windows, or without motion in them.
+
+    Example:
+        >>> t = np.arange(0.0, 30.0, 0.1)
+        >>> turned = np.random.default_rng(0).normal(0.0, 0.1, len(t) - 1)
+        >>> round(scale_of(Turns(t, 0.8 * turned), Turns(t, turned), 0.0), 6)
+        0.8
+    """
+    totals = []
+    for turns, late_s in ((seen, 0.0), (measured, offset_s)):
+        values = getattr(turns, of)
+        if len(values) != len(turns.times_s) - 1:
+            return math.nan
+        totals.append((turns.times_s + late_s, np.concatenate([[0.0], np.cumsum(values)])))
+    first_s, last_s = (max(t[0] for t, _ in totals), min(t[-1] for t, _ in totals))
+    windows = np.arange(first_s, last_s + 1e-9, _WINDOW_S)
+    if len(windows) < 2:
+        return math.nan
+    c, m = (np.diff(np.interp(windows, *total)) for total in totals)
+    moved = float(m @ m)
+    return float(c @ m) / moved if moved > 0.0 else math.nan
+
+
+def _compass_offset(motion: Source, measured: Turns) -> Offset | None:
+    """Return the offset of a source's compass, if its turns agree with the motion."""
+    times, headings = [], []
+    for frame in motion.frames(on_bad_frame=lambda _: None):
+        if frame.heading_rad is not None and not (times and frame.time_s <= times[-1]):
+            times.append(frame.time_s)
+            headings.append(frame.heading_rad)
+    if len(times) < 10:
+        return None
     try:
-        return best_offset(seen, measured)
-    except ValueError as error:
-        raise RunError(f"{spec}: {error}; give --offset S in seconds") from None
+        return best_offset(measured, Turns(np.array(times), np.diff(np.unwrap(headings))))
+    except ValueError:
+        return None
 
 
 def best_offset(seen: Turns, measured: Turns) -> Offset:
@@ -243,10 +366,12 @@ def _correlation_at(seen: Turns, measured: Turns, offset_s: float) -> float:
 
 def _seen(camera: Source, config: BrainConfig) -> Turns:
     odometry = VisualOdometry(config.odometry, config.view.grey)
-    times, turned = [], []
+    times, turned, moved = [], [], []
     for frame in camera.frames(on_bad_frame=lambda _: None):
         if frame.image is None or (times and not frame.time_s > times[-1]):
             continue
+        if times and frame.time_s > times[0] + _FIRST_S:
+            break
         dt_s = frame.time_s - times[-1] if times else 1.0 / config.frame_rate_hz
         try:
             velocity = odometry(frame.image, dt_s)
@@ -255,16 +380,18 @@ def _seen(camera: Source, config: BrainConfig) -> Turns:
         if times:
             gap = dt_s > config.max_gap_s  # images of two places do not measure motion
             turned.append(0.0 if gap else velocity.w_rad_s * dt_s)
+            moved.append(0.0 if gap else velocity.v_m_s * dt_s)
         times.append(frame.time_s)
-    return Turns(np.array(times), np.array(turned))
+    return Turns(np.array(times), np.array(turned), np.array(moved))
 
 
 def _measured(motion: Source) -> Turns:
-    times, turned = [], []
+    times, turned, moved = [], [], []
     for frame in motion.frames(on_bad_frame=lambda _: None):
         if frame.velocity is None or (times and not frame.time_s > times[-1]):
             continue
         if times:
             turned.append(frame.velocity.w_rad_s * (frame.time_s - times[-1]))
+            moved.append(frame.velocity.v_m_s * (frame.time_s - times[-1]))
         times.append(frame.time_s)
-    return Turns(np.array(times), np.array(turned))
+    return Turns(np.array(times), np.array(turned), np.array(moved))

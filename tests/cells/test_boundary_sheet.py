@@ -134,6 +134,23 @@ def test_noisy_beams_are_read_as_the_walls_that_are_there():
     assert np.sqrt(np.mean(error**2)) < 0.01  # single beams: 0.03 m
 
 
+def test_near_a_wall_noisy_beams_make_one_wall_of_its_bearing():
+    """Slanting beams tell the bearing: those within 40 degrees alone make two walls of one."""
+    rng, n = np.random.default_rng(3), 60
+    away = rng.uniform(0.03, 0.12, n)
+    for name in ("square", "circle2m"):
+        at = np.column_stack([1.0 - away, np.zeros(n)])
+        ranges = named_arena(name).ranges(at, np.zeros(n), 180, 5.0)
+        ranges += 0.03 * rng.standard_normal(ranges.shape)
+        wrong = rng.random(ranges.shape) < 0.1
+        ranges[wrong] = rng.uniform(0.0, 5.0, int(wrong.sum()))
+        read = [SHEET.walls_in_scan(np.maximum(r, 0.0)) for r in ranges]
+        assert sum(len(walls) == 1 for walls in read) >= 0.95 * n, name
+        one = np.array([walls[0] for walls in read])
+        assert np.std(one[:, 0] - away) < 0.008, name
+        assert np.std(np.remainder(one[:, 1] + np.pi, TWO_PI)) < math.radians(6.0), name
+
+
 @pytest.mark.parametrize("batch", [None, 2])
 def test_silent_boundary_cells_change_the_position(batch):
     def drive(share):

@@ -25,6 +25,7 @@ from neuroslam.cells.oscillators import (
 )
 from neuroslam.config import GridCellConfig
 from neuroslam.evaluation.gridness import gridness
+from neuroslam.evaluation.ratemap import Bins, rate_map
 
 CONFIG = GridCellConfig()
 UNDEVELOPED = GridCellConfig(development_steps=0)
@@ -426,6 +427,37 @@ def test_learning_online_on_a_walk_keeps_the_hexagons(grown):
             cells(oscillators.shift(torch.from_numpy(step)))
     assert not torch.equal(cells.feedforward, grown.feedforward)
     assert (medians(cells, CONFIG) > 1.2).all()
+
+
+def explored(config, steps):
+    """Rates of a network along a walk in a square of 1.2 m, and the positions."""
+    cells, oscillators = LAHNGridCells(config), VelocityOscillators(config)
+    rng, at = np.random.default_rng(11), np.zeros(2)
+    positions, rates, angle = np.empty((steps, 2)), [], 0.0
+    with torch.inference_mode():
+        for k in range(steps):
+            angle += rng.normal(0.0, 0.3)
+            step = 0.03 * np.array([math.cos(angle), math.sin(angle)])
+            if (np.abs(at + step) > 0.6).any():
+                angle += math.pi / 2
+                step = np.zeros(2)
+            at = positions[k] = at + step
+            oscillators.shift(torch.from_numpy(step))
+            rates.append(cells.rates_compiled(oscillators.phases.numpy()).flatten().copy())
+    return positions, np.array(rates)
+
+
+def test_random_weights_learn_grids_while_the_animal_explores_unless_they_learn_too_fast():
+    def score(**settings):
+        config = GridCellConfig(development_steps=0, spacings_m=(0.35, 0.46), **settings)
+        positions, rates = explored(config, 4000)
+        maps = rate_map(positions, rates, Bins.around(np.array([[-0.6, -0.6], [0.6, 0.6]])))
+        return np.median(gridness(maps))
+
+    slow = score(learns_online=True)
+    assert slow > 1.0
+    assert slow > score() + 0.15  # what their random mixtures of six waves score
+    assert slow > score(learns_online=True, online_share=1.0) + 0.15  # its fields wander
 
 
 @given(n_cells=st.integers(1, 30), seed=seeds)

@@ -350,6 +350,35 @@ def test_most_kidnapped_animals_notice_and_lost_ones_learn_nothing():
     assert (noticed <= 60.0).float().mean() >= 0.7
 
 
+@pytest.mark.parametrize("batch", [None, 1])
+def test_a_scanner_slower_than_the_odometry_does_not_make_the_animal_lost(batch):
+    minutes = 3.0 if batch is None else 2.0  # walls are known for long after one
+    walk = roam(named_arena("circle1m"), minutes, np.random.default_rng(8), 20.0)
+    senses = sense(walk, SenseNoise(), [2], k=2)
+
+    def lost_s(looks):
+        cells = NavigationCells(CONFIG, batch)
+        for k, dt_s in enumerate(senses.dt_s.tolist()):
+            sensed = k % 3 == 0
+            at = (0, k) if batch is None else (slice(None), k)
+            far = np.full_like(senses.wall_m[at], np.inf)
+            row = [senses.speed_m_s[at], senses.heading_rad[at]]
+            row += [senses.wall_m[at] if sensed else far, senses.wall_bearing_rad[at]]
+            speed, heading, wall, bearing = map(torch.as_tensor, row)
+            cells(speed, heading, dt_s, wall, bearing, sensed=sensed or looks)
+        return cells.now.lost_s
+
+    assert lost_s(looks=False) == 0.0
+    assert lost_s(looks=True) > 0.0  # to look and to find none is evidence
+
+
+def test_a_frame_without_walls_is_no_look_and_an_empty_list_of_them_is_one():
+    cells, motion = NavigationCells(CONFIG), Motion(0.1, 0.0, 0.4)
+    for walls, since_s in ((None, 0.4), (None, 0.5), (np.empty((0, 2)), 0.0), (None, 0.4)):
+        cells.advance(motion, 0.0, walls)
+        assert cells.now.since_s == pytest.approx(since_s)
+
+
 def test_no_animal_is_reported_lost_in_ten_minutes_of_walking():
     arenas = ("triangle", "circle1m", "circle2m", "square", "pillar")
     senses = rows_of(

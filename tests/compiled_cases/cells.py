@@ -103,12 +103,13 @@ def oscillators(rng):
     return pairs
 
 
-@case("cells.grid.rates_step")
+@case("cells.grid.rates_step", "cells.grid.learn_step")
 @torch.inference_mode()
 def grid_cells(rng):
     n_cells = int(rng.integers(1, 26))
     config = GridCellConfig(
-        n_cells=n_cells, development_steps=5, learns_online=rng.random() < 0.3,
+        n_cells=n_cells, development_steps=5, learns_online=rng.random() < 0.5,
+        online_share=float(rng.choice([0.01, 1.0])),
         lateral=rng.choice(["learned", "kernel", "both"]),
     )  # fmt: skip
     ours, theirs = twins(lambda: LAHNGridCells(config))

@@ -6,11 +6,17 @@ import math
 import numpy as np
 import pytest
 
-from neuroslam.cells.boundary import ATTENUATION, GROWTH, INHIBITION
+from neuroslam.cells.boundary import ATTENUATION, GROWTH, INHIBITION, BoundaryCells
 from neuroslam.config import BoundaryCellConfig, BrainConfig, GridCellConfig
 from neuroslam.evaluation.gridness import gridness
 from neuroslam.evaluation.ratemap import rate_map
-from neuroslam.experiments import boundary_cells, grid_cells, grid_comparison
+from neuroslam.experiments import (
+    boundary_cells,
+    boundary_sheet,
+    grid_cells,
+    grid_comparison,
+    grid_learning,
+)
 from neuroslam.experiments.census import CensusRecorder, arena_bins, by_seed, median, simulate_grid
 from neuroslam.worlds.arena import named_arena
 from neuroslam.worlds.rodent import roam
@@ -98,7 +104,45 @@ def test_the_scenarios_are_written_and_are_as_in_the_paper(tmp_path):
     assert json.loads((tmp_path / "results.json").read_text()) == result
     assert [row["scenario"][0] for row in result["rows"]] == list("ACDBFE")
     assert all(row["as_in_the_paper"] for row in result["rows"])
-    assert all((tmp_path / f"{name}.png").is_file() for name in ("scenarios", "firing_maps"))
+    figures = ("scenarios", "active_cells", "firing_maps")
+    assert all((tmp_path / f"{name}.png").is_file() for name in figures)
+
+
+def test_the_active_cells_are_those_of_the_walls_bearing_and_distance():
+    cells = BoundaryCells(BoundaryCellConfig())
+    for letter, bearings in (("A", {0.0}), ("C", {0.0}), ("D", {0.0, 90.0}), ("B", {0.0, 90.0})):
+        scenario = next(s for s in boundary_cells.SCENARIOS if s.letter == letter)
+        active = boundary_cells.active_cells(scenario)
+        at_10_cm = active.rates[active.moments.index("10 cm")]
+        best = {cells.preferred_rad[at_10_cm.max(axis=1).argmax()].rad2deg().item()}
+        if len(bearings) == 2:
+            assert at_10_cm[0].max() == pytest.approx(at_10_cm[6].max(), rel=1e-6)
+        assert best <= bearings
+        preferred_m = cells.preferred_m[at_10_cm.max(axis=0).argmax()].item()
+        assert preferred_m == pytest.approx(0.1, abs=0.022)  # half a step of the population
+
+
+def test_grid_learning_is_scored_by_weights_and_by_the_path(rodent, tmp_path):
+    result = grid_learning.grid_learning(rodent, tmp_path, minutes=0.2, seeds=[0])
+    assert json.loads((tmp_path / "results.json").read_text()) == result
+    assert (tmp_path / "grid_learning.png").is_file()
+    weights = {(r["condition"], r["time_s"]): r["gridness_of_weights"] for r in result["rows"]}
+    assert len(weights) == 2 * len(grid_learning.CONDITIONS)
+    fixed = weights["random, fixed", 2.0]
+    assert weights["random, fixed", 10.0] == fixed
+    assert weights["random, learns", 10.0] > fixed
+    assert weights["developed, fixed", 10.0] > 1.2
+
+
+def test_boundary_cells_in_the_loop_are_run_with_feet_and_with_noisy_beams(rodent, tmp_path):
+    result = boundary_sheet.boundary_cells_in_loop(
+        rodent, tmp_path, minutes=0.5, seeds=[3], few_seeds=[3], tracks=["pentagon"]
+    )
+    rows = {(row["input"], row["condition"]): row for row in result["rows"]}
+    assert len(rows) == len(boundary_sheet.CONDITIONS) + 2
+    feet = [rows["feet", name]["error_m"] for name in ("raw walls", "boundary cells")]
+    assert feet[1] == pytest.approx(feet[0], rel=0.1)
+    assert all((tmp_path / f"{name}.png").is_file() for name in ("feet", "noisy_beams"))
 
 
 def test_nan_is_written_as_null(tmp_path):

@@ -8,9 +8,16 @@ import pytest
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError, SourceError
-from neuroslam.runs.clocks import Turns, best_offset, find_offset, resolve_offset
+from neuroslam.runs.clocks import (
+    Turns,
+    best_offset,
+    find_joint_start,
+    joint_start,
+    resolve_offset,
+    scale_of,
+)
 from neuroslam.runs.reading import read_plan
-from neuroslam.sensors import open_source
+from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.open import absolute_spec, seeded_spec, with_offset
 
 EPOCH_S = 1_700_000_000.0
@@ -53,6 +60,10 @@ def drive(tmp_path_factory):
     return home, -EPOCH_S - early / RATE_HZ
 
 
+def find_offset(spec, config):
+    return find_joint_start(spec, config).offset
+
+
 def pair(home, motion="motion.csv"):
     return f"{home}/drive.avi+{home}/{motion}"
 
@@ -64,6 +75,54 @@ def test_the_offset_is_found_by_the_turn_rates(drive):
     assert found.correlation > 0.9
     swapped = f"{home}/motion.csv+{home}/drive.avi"
     assert find_offset(swapped, BrainConfig()).offset_s == pytest.approx(true_s, abs=0.01)
+
+
+def test_the_scale_of_turns_is_that_of_the_field_of_view(drive):
+    start = find_joint_start(pair(drive[0]), BrainConfig())
+    true_deg = np.degrees(96 / 40)  # a picture of 96 columns, each 1 / 40 rad
+    assert BrainConfig().odometry.fov_deg / start.turn_scale == pytest.approx(true_deg, rel=0.05)
+    assert start.compass is None
+    _, notes = resolve_offset(pair(drive[0]), "auto", BrainConfig())
+    assert any("odometry.fov_deg" in note for note in notes)
+
+
+class WithCompass(Source):
+    """A source of motion with a compass."""
+
+    name, n_frames, frame_rate_hz = "motion with a compass", None, RATE_HZ
+
+    def __init__(self, motion, headings_rad):
+        self.motion, self.headings_rad = motion, headings_rad
+
+    def frames(self, start=0, stop=None, on_bad_frame=None):
+        for frame in self.motion.frames(start, stop, on_bad_frame):
+            yield frame._replace(heading_rad=float(self.headings_rad[frame.index]))
+
+
+def test_a_compass_that_lags_is_found_by_its_turns(drive):
+    home, true_s = drive
+    rates = turn_rates(0, N + 26)
+    times_s = np.arange(len(rates)) / RATE_HZ
+    heading = 2.0 + np.interp(times_s - 0.15, times_s, np.cumsum(rates) / RATE_HZ)
+    heading += np.radians(0.3) * np.random.default_rng(4).standard_normal(len(heading))
+    wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
+    motion = WithCompass(open_source(home / "motion.csv"), wrapped)
+    found = joint_start(open_source(home / "drive.avi"), motion, BrainConfig())
+    assert found.offset.offset_s == pytest.approx(true_s, abs=0.01)
+    assert found.compass.offset_s == pytest.approx(-0.15, abs=0.03)
+
+
+def test_scales_average_noise_of_the_camera_and_are_unknown_without_motion():
+    t, rng = np.arange(0.0, 120.0, 0.05), np.random.default_rng(1)
+    turned, moved = 0.05 * turn_rates(3, len(t) - 1), rng.uniform(0.0, 0.03, len(t) - 1)
+    noisy = 1.3 * turned + 0.005 * rng.standard_normal(len(turned))
+    seen, measured = Turns(t, noisy, 40.0 * moved), Turns(t + 7.0, turned, moved)
+    assert scale_of(seen, measured, -7.0) == pytest.approx(1.3, rel=0.02)
+    assert scale_of(seen, measured, -7.0, "moved_m") == pytest.approx(40.0, rel=1e-6)
+    still = Turns(t, np.zeros_like(turned))
+    assert np.isnan(scale_of(seen, still, 0.0))
+    assert np.isnan(scale_of(still, measured, -7.0, "moved_m"))  # no distances
+    assert np.isnan(scale_of(seen, measured, 500.0))
 
 
 @pytest.mark.parametrize("late_s", [-3.21, 0.0, 0.017, 4.5])
