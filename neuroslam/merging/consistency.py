@@ -202,11 +202,7 @@ def weakness(loaded: Mapped, partial: Mapped, pairs: Pairs, result: Consistency)
             f"view.threshold half; expected {confirm} (--confirm) and more than half of them; "
             "drive more of the common path in both sessions"
         )
-    views = [
-        one.map.experiences["template"].numpy()[ids]
-        for one, ids in ((loaded, kept.loaded), (partial, kept.partial))
-    ]
-    n_views = min(len(np.unique(ids)) for ids in views)
+    n_views = count_views(loaded.map, partial.map, kept)
     if n_views < confirm:
         return (
             f"{counted(len(kept.partial), 'experience')} matched, but only by "
@@ -235,6 +231,12 @@ def _support(pairs: Pairs, threshold: float) -> float:
     """Count the places of pairs; a pair whose match error exceeds the threshold counts half."""
     within = n_places(pairs.pick(pairs.error <= threshold))
     return 0.5 * (within + n_places(pairs))
+
+
+def count_views(loaded: ExperienceMap, partial: ExperienceMap, pairs: Pairs) -> int:
+    """Count the templates by which pairs were matched, on the map that has fewer of them."""
+    ends = (loaded, pairs.loaded), (partial, pairs.partial)
+    return min(len(np.unique(one.experiences["template"].numpy()[ids])) for one, ids in ends)
 
 
 def common_path(result: Consistency, config: BrainConfig) -> np.ndarray:

@@ -72,7 +72,8 @@ def _match_views(loaded: Mapped, partial: Mapped) -> Found:
         return Found(
             None,
             f"{counted(len(np.unique(pairs.partial)), 'experience')} matched by view, but at most "
-            f"{sizes[0]} agree on the alignment; expected {confirm} (--confirm)",
+            f"{sizes[0]} agree on the alignment; expected {confirm} (--confirm); "
+            + _remedy(candidates, threshold),
             sizes,
         )
     confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
@@ -99,6 +100,16 @@ def _match_views(loaded: Mapped, partial: Mapped) -> Found:
         others=_once(matched),
     )
     return Found(match, f"{counted(len(match.pairs.partial), 'experience')} matched by view", sizes)
+
+
+def _remedy(candidates: Candidates, threshold: float) -> str:
+    distinct = len(np.unique(candidates.pairs.partial))
+    if 2 * distinct < candidates.alike:
+        return (
+            f"{candidates.alike - distinct} more match at several places: make both maps with "
+            f"view.threshold below {threshold:g}"
+        )
+    return "drive more of the common path in both sessions"
 
 
 def _none_alike(candidates: Candidates, threshold: float) -> str:
