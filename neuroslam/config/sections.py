@@ -441,8 +441,8 @@ class SessionConfig(Section):
         default=0.001,
         gt=0,
         lt=1,
-        description="share of right merges that the chi-square test of the residuals refuses; "
-        "larger: more merges are refused",
+        description="share of right merges that the test of the residuals refuses; larger: more "
+        "merges are refused",
     )
     check_residuals: bool = Field(
         default=True,

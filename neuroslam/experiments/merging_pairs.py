@@ -32,7 +32,7 @@ from neuroslam.worlds.scene import Sense, Surface, World, rounded_route
 from neuroslam.worlds.site import Site
 from neuroslam.worlds.world import WorldOptions, WorldSource
 
-HALVES = {"development": 1, "held-out": 2}
+HALVES = {"development": 1, "second": 2, "held-out": 3}
 """Halves of the pairs, and the seed of each."""
 
 RECORDINGS = ("usi_track1", "usi_day1", "usi_day2", "circuit_launch")
@@ -70,7 +70,8 @@ _WORLDS: dict[str, dict[str, Any]] = {
 
 _TRACKS = {
     "development": {"usi_track1": (0, 2800), "usi_day1": (0, 1889), "circuit_launch": (0, 500)},
-    "held-out": {"usi_day2": (0, 3070), "usi_day1": (1889, 3778), "circuit_launch": (500, 1000)},
+    "second": {"usi_day2": (0, 3070), "usi_day1": (1889, 3778), "circuit_launch": (500, 1000)},
+    "held-out": {"usi_day2": (0, 3070), "usi_day1": (0, 3778), "circuit_launch": (0, 1000)},
 }
 
 

@@ -64,20 +64,25 @@ def matched(n):
     return Pairs(ids, ids.copy(), np.zeros(n), np.zeros(n))
 
 
-@pytest.mark.parametrize("rate", [0.1, 0.3])
-def test_right_merges_are_refused_at_the_stated_rate(rate):
-    config = BrainConfig(sessions={"false_alarm": rate})
+def test_residuals_of_right_merges_follow_chi_square_and_few_are_refused():
+    """The rise has the mean and variance of its degrees of freedom, 3 for each pair but one."""
+    config = BrainConfig(sessions={"false_alarm": 0.1})
     cells = config.pose_cells
     aside = [0.5 * cells.create_threshold_cells * cells.cell_size_m] * 2 + [VIEW_SIGMA_RAD]
-    rng, n, trials, refused = np.random.default_rng(3), 8, 80, 0
+    rng, n, trials = np.random.default_rng(3), 8, 100
+    results = []
     for _ in range(trials):
         places = arc(n)
         one = drive(rng, places, config)
         # The second drive passes the places at some distance and in another heading.
         other = drive(rng, places + rng.normal(0.0, aside, places.shape), config, 2.0)
-        result = check_consistency(one, other, matched(n), config, robust=False)
-        refused += result.excess > result.allowed
-    assert refused / trials == pytest.approx(rate, abs=3.0 * math.sqrt(rate * (1 - rate) / trials))
+        results.append(check_consistency(one, other, matched(n), config, robust=False))
+    excess, freedom = np.array([result.excess for result in results]), 3 * (n - 1)
+    variance = 2.0 * freedom
+    assert excess.mean() == pytest.approx(freedom, abs=3.0 * math.sqrt(variance / trials))
+    assert excess.var() == pytest.approx(variance, rel=3.0 * math.sqrt(2.0 / trials) + 0.1)
+    refused = np.mean([result.excess > result.allowed for result in results])
+    assert refused <= 0.1 + 3.0 * math.sqrt(0.09 / trials)
 
 
 def test_a_wrong_pair_is_left_out_and_the_right_ones_stay():
