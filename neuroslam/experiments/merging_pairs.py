@@ -1,8 +1,9 @@
 """Merges of pairs of short maps: those that overlap, and those that only look alike.
 
-The drives, their cuts and the pairs follow from a seed. The half ``development`` served to choose
-the rules of :mod:`neuroslam.merging`; the half ``held-out`` has other textures, other recordings,
-other noise and other cuts. A merge is right if the maps overlap, at least 95 % of the matched pairs
+The drives, their cuts and the pairs follow from a seed. The set ``development`` served to choose
+the rules of :mod:`neuroslam.merging`, ``second`` to change them once; ``held-out`` was looked at
+once, with the rules fixed. They differ in textures, buildings, noise and cuts; the recordings of
+``held-out`` are those of the others, cut elsewhere. A merge is right if the maps overlap, at least 95 % of the matched pairs
 of experiences are the same place in truth, and the merged map fits the truth about as well as the
 maps did before.
 """
@@ -33,7 +34,7 @@ from neuroslam.worlds.site import Site
 from neuroslam.worlds.world import WorldOptions, WorldSource
 
 HALVES = {"development": 1, "second": 2, "held-out": 3}
-"""Halves of the pairs, and the seed of each."""
+"""Sets of pairs, and the seed of each."""
 
 RECORDINGS = ("usi_track1", "usi_day1", "usi_day2", "circuit_launch")
 
@@ -122,7 +123,7 @@ class Pair(NamedTuple):
 
 
 def drives(half: str) -> list[Drive]:
-    """Return the drives of a half."""
+    """Return the drives of a set."""
     seed = HALVES[half]
     rng = np.random.default_rng([17, seed])
     found: list[Drive] = []
@@ -291,7 +292,7 @@ def run_drive(drive: Drive, data: Path) -> Driven:
 
 
 def pairs(half: str, driven: list[Driven]) -> list[Pair]:
-    """Choose the pairs of a half: as many of each kind as ``N_TRUE`` and ``N_FALSE`` say."""
+    """Choose the pairs of a set: as many of each kind as ``N_TRUE`` and ``N_FALSE`` say."""
     rng = np.random.default_rng([18, HALVES[half]])
     found: dict[str, list[Pair]] = {kind: [] for kind in (*N_TRUE, *N_FALSE)}
     for i, j in combinations(range(len(driven)), 2):
@@ -425,7 +426,7 @@ def table(rows: list[dict[str, Any]], half: str) -> list[dict[str, Any]]:
 
 
 def merging_pairs(data: Path, out: Path) -> dict[str, Any]:
-    """Try 100 pairs of maps that overlap and 300 that do not, in each half.
+    """Try 100 pairs of maps that overlap and 300 that do not, in each set.
 
     Args:
         data: Folder that holds the recordings.
