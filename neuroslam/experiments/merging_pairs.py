@@ -3,9 +3,9 @@
 The drives, their cuts and the pairs follow from a seed. The set ``development`` served to choose
 the rules of :mod:`neuroslam.merging`, ``second`` to change them once; ``held-out`` was looked at
 once, with the rules fixed. They differ in textures, buildings, noise and cuts; the recordings of
-``held-out`` are those of the others, cut elsewhere. A merge is right if the maps overlap, at least 95 % of the matched pairs
-of experiences are the same place in truth, and the merged map fits the truth about as well as the
-maps did before.
+``held-out`` are those of the others, cut elsewhere. A merge is right if the maps overlap, at least
+95 % of the matched pairs of experiences are the same place in truth, and the merged map of a
+rendered world fits the truth about as well as the maps did before.
 """
 
 import json
