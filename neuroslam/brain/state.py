@@ -19,6 +19,7 @@ from neuroslam.errors import ConfigError, counted
 from neuroslam.geometry import compose
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import n_places
+from neuroslam.merging.consistency import count_views
 from neuroslam.merging.limits import WINDOW, elsewhere, tolerance
 from neuroslam.merging.mapped import counts_of, differing
 from neuroslam.merging.match import shared_history
@@ -356,6 +357,8 @@ class BrainState(QuickModule):
         agreed = recognition.confirmed(where, loaded, self.map, limits)
         if n_places(agreed) < config.confirm:
             return False
+        if config.check_residuals and count_views(loaded, self.map, agreed) < config.confirm:
+            return False  # one view along the whole path tells nothing about the place
         near = templates[~elsewhere(loaded, int(agreed.loaded[-1]), limits)]
         match = Match(
             loaded=int(agreed.loaded[-1]),

@@ -118,22 +118,41 @@ def resume_command(
 
 
 def merge_command(
-    first: Annotated[
-        Path, typer.Argument(metavar="A", help="Folder or brain file of the map merged into.")
-    ],
-    second: Annotated[
-        Path, typer.Argument(metavar="B", help="Folder or brain file of the session merged.")
+    maps: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="A B [C ...]",
+            help="Folders or brain files: the map merged into, and the sessions merged; the last "
+            "can be resumed.",
+        ),
     ],
     out: Out,
     confirm: Confirm = None,
+    assignments: Assignments = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Merge two finished sessions; exit 3 if the merge is refused: nothing is written then."""
+    """Merge finished sessions; exit 3 if a merge is refused: nothing is written then.
+
+    Of several, every pair is matched, and the best is merged first.
+    """
+    from neuroslam.errors import RunError
     from neuroslam.runs.merge import merge_runs
     from neuroslam.runs.reading import length_unit
 
-    summary, reports = merge_runs(first, second, out, confirm=confirm, overwrite=overwrite)
-    unit = length_unit(first) if length_unit(first) == length_unit(second) else "m"
+    if len(maps) < 2:
+        raise RunError("merge: one map is given; expected two or more")
+    first, *between, last = maps
+    summary, reports = merge_runs(
+        first,
+        last,
+        out,
+        between=between,
+        confirm=confirm,
+        assignments=assignments or (),
+        overwrite=overwrite,
+    )
+    units = {length_unit(one) for one in maps}
+    unit = units.pop() if len(units) == 1 else "m"
     for report in reports:
         _print_report(report.to_dict(), unit)
     if summary is None:

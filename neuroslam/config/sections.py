@@ -450,11 +450,18 @@ class SessionConfig(Section):
     residual_factor: float = Field(
         default=2.0,
         ge=1,
-        description="largest ratio of link residuals after a merge to those before; a merge above "
-        "it is refused; larger: more merges are accepted",
+        description="factor on the expected standard deviations of odometry in the test of a "
+        "merge; larger: more merges are accepted",
+    )
+    false_alarm: float = Field(
+        default=0.001,
+        gt=0,
+        lt=1,
+        description="share of right merges that the test of the residuals refuses; larger: more "
+        "merges are refused",
     )
     check_residuals: bool = Field(
         default=True,
-        description="refuse a merge whose links do not fit after relaxation; false: accept every "
-        "merge, as in the paper",
+        description="refuse a merge whose views are not distinct, whose path does not turn, or "
+        "whose links do not fit; false: accept every merge, as in the paper",
     )

@@ -19,6 +19,7 @@ EXPERIMENTS = {
     "five-sessions": (_SESSIONS, "five_sessions", None),
     "campus": (_SESSIONS, "campus", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
+    "merging-pairs": ("neuroslam.experiments.merging_pairs", "merging_pairs", "."),
     "compare": ("neuroslam.experiments.compare", "compare", None),
     "pixel-landmarks": ("neuroslam.experiments.compare", "pixel_landmarks", None),
     "populations": ("neuroslam.experiments.populations", "populations", None),

@@ -14,15 +14,23 @@ WINDOW = 3
 """n matches may span up to this many times n experiences, because some views are missed."""
 
 
+def spacing_m(maps: Sequence[ExperienceMap], config: BrainConfig) -> float:
+    """Return the distance of neighbours: the median link, or the size of an experience if larger.
+
+    That size is ``create_threshold_cells`` of the pose cells.
+    """
+    cells = config.pose_cells
+    place_m = cells.create_threshold_cells * cells.cell_size_m
+    lengths = np.concatenate([one.links.distance_m for one in maps])
+    return max(float(np.median(lengths)), place_m) if len(lengths) else place_m
+
+
 def tolerance(maps: Sequence[ExperienceMap], config: BrainConfig) -> Tolerance:
     """Return the tolerances, from the size of an experience and the median length of a link."""
     cells, sessions = config.pose_cells, config.sessions
-    place_m = cells.create_threshold_cells * cells.cell_size_m
-    lengths = np.concatenate([one.links.distance_m for one in maps])
-    spacing_m = float(np.median(lengths)) if len(lengths) else place_m
     return Tolerance(
-        near_m=2.0 * WINDOW * sessions.confirm * max(spacing_m, place_m),
-        place_m=place_m,
+        near_m=2.0 * WINDOW * sessions.confirm * spacing_m(maps, config),
+        place_m=cells.create_threshold_cells * cells.cell_size_m,
         drift=sessions.drift,
         turn_rad=math.radians(sessions.turn_tolerance_deg),
     )

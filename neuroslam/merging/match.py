@@ -8,11 +8,12 @@ from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
 from neuroslam.mapping.tables import Origins, origin_key
+from neuroslam.merging.candidates import Candidates, find_candidates
+from neuroslam.merging.consistency import check_consistency, weakness
 from neuroslam.merging.limits import elsewhere, far_off, tolerance
 from neuroslam.merging.mapped import Mapped, differing
 from neuroslam.state.match import Match, Pairs
 from neuroslam.state.sessions import session_name
-from neuroslam.types import NO_TEMPLATE
 
 
 class Found(NamedTuple):
@@ -58,75 +59,74 @@ def find_match(loaded: Mapped, partial: Mapped) -> Found:
 
 def _match_views(loaded: Mapped, partial: Mapped) -> Found:
     """Match the templates of either map with the other, and keep the pairs that agree."""
-    pairs, best = _alike(loaded, partial)
-    threshold, confirm = partial.config.view.threshold, partial.config.sessions.confirm
+    config = partial.config
+    threshold, confirm = config.view.threshold, config.sessions.confirm
+    candidates = find_candidates(loaded, partial)
+    pairs = candidates.pairs
     if not len(pairs.partial):
-        nearest = "" if best is None else f"; the smallest match error is {best:.4f}"
-        return Found(
-            None, f"no view of one map matches one of the other within {threshold:g}{nearest}"
-        )
-    limits = tolerance((loaded.map, partial.map), partial.config)
+        return Found(None, _none_alike(candidates, threshold))
+    limits = tolerance((loaded.map, partial.map), config)
     groups = [pairs.pick(g) for g in agreeing(pairs, partial.map.poses, loaded.map.poses, limits)]
     sizes = tuple(n_places(group) for group in groups)
     if sizes[0] < confirm:
         return Found(
             None,
             f"{counted(len(np.unique(pairs.partial)), 'experience')} matched by view, but at most "
-            f"{sizes[0]} agree on the alignment; expected {confirm} (--confirm)",
+            f"{sizes[0]} agree on the alignment; expected {confirm} (--confirm); "
+            + _remedy(candidates, threshold),
             sizes,
         )
     confirmed = [group for group, size in zip(groups, sizes, strict=True) if size >= confirm]
     first = confirmed[0]
     at = int(np.argmin(first.error))
     consistent = [g for g in confirmed[1:] if _fits(first, at, g, loaded.map, partial.map, limits)]
-    others = Pairs(*(np.concatenate(columns) for columns in zip(first, *consistent, strict=True)))
+    matched = Pairs(*(np.concatenate(columns) for columns in zip(first, *consistent, strict=True)))
+    if config.sessions.check_residuals:
+        result = check_consistency(loaded.map, partial.map, matched, config, robust=True)
+        refused = weakness(loaded, partial, matched, result)
+        if refused:
+            return Found(None, refused, sizes)
+        matched = matched.pick(result.inlier)
+        # Beyond the threshold a view is another view: such pairs are evidence, not one experience.
+        within = matched.pick(matched.error <= threshold)
+        matched = within if n_places(within) >= confirm else matched
+        at = int(np.argmin(matched.error))
     match = Match(
-        loaded=int(first.loaded[at]),
-        partial=int(first.partial[at]),
-        turn_rad=float(first.turn_rad[at]),
-        error=float(first.error[at]),
-        runner_up=_runner_up(loaded, partial, first, at, limits),
-        others=_once(others),
+        loaded=int(matched.loaded[at]),
+        partial=int(matched.partial[at]),
+        turn_rad=float(matched.turn_rad[at]),
+        error=float(matched.error[at]),
+        runner_up=_runner_up(loaded, partial, matched, at, limits),
+        others=_once(matched),
     )
     return Found(match, f"{counted(len(match.pairs.partial), 'experience')} matched by view", sizes)
 
 
-def _alike(loaded: Mapped, partial: Mapped) -> tuple[Pairs, float | None]:
-    """Return the pairs of experiences whose views match, and the smallest match error."""
-    seen: dict[tuple[int, int], tuple[float, float]] = {}
-    best: float | None = None
-    threshold = partial.config.view.threshold
-    for queries, memory, sign in (
-        (partial.view, loaded.view, 1.0),
-        (loaded.view, partial.view, -1.0),
-    ):
-        for view in range(queries.n):
-            match = memory.search(queries.stored_view(view), threshold)
-            if match.template == NO_TEMPLATE:
-                continue
-            best = match.error if best is None else min(best, match.error)
-            if match.error > threshold:
-                continue
-            memory.last.template = match.template  # the next match is likely next to it
-            key = (view, match.template) if sign > 0 else (match.template, view)
-            row = (sign * match.relative_heading_rad, match.error)
-            if key not in seen or row[1] < seen[key][1]:
-                seen[key] = row
-    at = [_experiences_of_views(brain) for brain in (partial, loaded)]
-    rows = [
-        (z, u, turn, error)
-        for (view_z, view_u), (turn, error) in seen.items()
-        for z in at[0].get(view_z, ())
-        for u in at[1].get(view_u, ())
-    ]
-    return Pairs.of(sorted(rows)), best
+def _remedy(candidates: Candidates, threshold: float) -> str:
+    distinct = len(np.unique(candidates.pairs.partial))
+    if 2 * distinct < candidates.alike:
+        return (
+            f"{candidates.alike - distinct} more match at several places: make both maps with "
+            f"view.threshold below {threshold:g}"
+        )
+    return "drive more of the common path in both sessions"
 
 
-def _experiences_of_views(brain: Mapped) -> dict[int, list[int]]:
-    experiences: dict[int, list[int]] = {}
-    for experience, view in enumerate(brain.map.experiences["template"].tolist()):
-        experiences.setdefault(view, []).append(experience)
-    return experiences
+def _none_alike(candidates: Candidates, threshold: float) -> str:
+    """Return why there are no candidates, and what helps."""
+    if candidates.alike:
+        n = counted(candidates.alike, "experience")
+        return (
+            f"{n} matched by view, but no view is distinct: each matches several places of a map; "
+            f"make both maps with view.threshold below {threshold:g}, or with larger templates"
+        )
+    nearest = (
+        "" if candidates.best is None else f"; the smallest match error is {candidates.best:.4f}"
+    )
+    return (
+        f"no view of one map matches one of the other within {threshold:g}{nearest}; if both show "
+        "one place, drive more of it the same way, or try a larger --set view.threshold"
+    )
 
 
 def shared_history(loaded: Mapped, partial: Mapped) -> Found | None:

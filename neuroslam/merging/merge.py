@@ -8,7 +8,7 @@ import numpy as np
 from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.joining import links_kept
-from neuroslam.merging.limits import far_off, tolerance
+from neuroslam.merging.consistency import check_consistency, inconsistency
 from neuroslam.merging.mapped import Mapped, differing
 from neuroslam.merging.report import MergeReport
 from neuroslam.merging.states import merge_states, part_of
@@ -18,12 +18,6 @@ from neuroslam.state.mergeable import State
 
 _CHECK_STEPS = 2_000_000
 """Links times loops of the trial relaxation of a merged map: a fraction of a second."""
-
-_STRAINED = 0.1
-"""A link is strained if its residual after relaxation exceeds this share of its length."""
-
-_TORN = 0.5
-"""Allowed residual of strained links, as a share of their length, for errors of odometry."""
 
 
 class Merged(NamedTuple):
@@ -43,8 +37,9 @@ class Merged(NamedTuple):
 def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     """Merge the states of two brains into a new one; neither is altered.
 
-    A copy of the merged map is relaxed first. If the residuals of links remain much larger than
-    before, the matched experiences were not the same, and the merge is refused.
+    If the matched pairs raise the residuals of the links by more than the noise of odometry can
+    explain, the matched experiences were not the same, and the merge is refused; see
+    :mod:`neuroslam.merging.consistency`.
 
     Args:
         loaded: The brain that is merged into; its ids stay.
@@ -63,9 +58,6 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     if apart:
         report.reason = f"the maps have different configs: {'; '.join(apart)}"
         return Merged(None, None, report)
-    report.reason = _beyond_odometry(loaded, partial, match)
-    if report.reason:
-        return Merged(None, None, report)
     one, other = (
         {n: value.cpu() for n, value in brain.state_dict().items() if not n.startswith("stored.")}
         for brain in (loaded, partial)
@@ -77,37 +69,19 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
         merged.reset_links()  # a merged place cell has the position of the loaded one
         state |= {f"map.{name}": value for name, value in merged.state_dict().items()}
     _describe(report, loaded, partial, merged, match, join)
-    strain, allowed = _strain(report, loaded.map, partial, merged, join)
-    if strain > allowed and partial.config.sessions.check_residuals:
-        report.reason = (
-            f"the merged map is inconsistent: its strained links have a residual of "
-            f"{strain:.3f} m (RMS) after relaxation; expected at most {allowed:.3f} m"
+    _describe_residuals(report, loaded.map, partial, merged, join)
+    if partial.config.sessions.check_residuals and partial.leader.relaxes_map:
+        report.reason = inconsistency(
+            check_consistency(loaded.map, partial.map, match.pairs, partial.config, robust=False)
         )
-        return Merged(None, join, report)
+        if report.reason:
+            return Merged(None, join, report)
     report.merged = True
     new = merged.n - loaded.map.n
     report.reason = (
         f"{counted(new, 'experience is', 'experiences are')} new" if new else "no experience is new"
     )
     return Merged(state, join, report)
-
-
-def _beyond_odometry(loaded: Mapped, partial: Mapped, match: Match) -> str:
-    """Return why the pairs of a match exceed the drift of odometry; empty if they do not."""
-    pairs = match.pairs
-    inside = (pairs.loaded < loaded.map.n) & (pairs.partial < partial.map.n)
-    if len(pairs.partial) == 1 or not inside.all():
-        return ""
-    limits = tolerance((loaded.map, partial.map), partial.config)
-    off_m, allowed_m = far_off(pairs, loaded.map, partial.map, limits)
-    worst = int(np.argmax(off_m - allowed_m))
-    if off_m[worst] <= allowed_m[worst]:
-        return ""
-    return (
-        f"experiences {pairs.partial[worst]} and {pairs.loaded[worst]} cannot be the same: aligned "
-        f"by the match they are {off_m[worst]:.2f} m apart; expected at most "
-        f"{allowed_m[worst]:.2f} m of odometry drift"
-    )
 
 
 def _describe(
@@ -159,24 +133,19 @@ def _describe(
         }
 
 
-def _strain(
+def _describe_residuals(
     report: MergeReport, loaded: ExperienceMap, partial: Mapped, merged: ExperienceMap, join: Join
-) -> tuple[float, float]:
-    """Relax a copy of the merged map; return the RMS residual of strained links and its limit."""
+) -> None:
+    """Relax a copy of the merged map; report the residuals of links and how far the map moved."""
     new = links_kept(partial.map.links, loaded.links, join)
     before = np.concatenate([loaded.residuals_m, partial.map.residuals_m[new]])
     trial = deepcopy(merged)
     loops = min(max(_CHECK_STEPS // max(1, len(before)), 100), 5000)
     if len(join.kept_experiences) < len(join.experiences) - 1:  # one experience strains nothing
         trial.relax(loops)
-    after, length = trial.residuals_m, trial.links.distance_m
-    report.residual_before_m, report.residual_after_m = _rms(before), _rms(after)
+    report.residual_before_m, report.residual_after_m = _rms(before), _rms(trial.residuals_m)
     moved = trial.poses[:, :2] - merged.poses[:, :2]
     report.largest_correction_m = float(np.hypot(*moved.T).max())
-    strained = (after > before) & (after > _STRAINED * length)
-    factor = partial.config.sessions.residual_factor
-    allowed = max(factor * _rms(before[strained]), _TORN * _rms(length[strained]))
-    return _rms(after[strained]), allowed
 
 
 def _rms(values: np.ndarray) -> float:

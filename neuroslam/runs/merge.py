@@ -1,18 +1,21 @@
-"""Merging of two finished sessions, given as runs or brain files, into a run folder."""
+"""Merging of finished sessions, given as runs or brain files, into a run folder."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain
-from neuroslam.errors import RunError
-from neuroslam.merging.match import find_match
+from neuroslam.errors import ConfigError, RunError
+from neuroslam.merging.match import Found, find_match
 from neuroslam.merging.report import MergeReport
 from neuroslam.runs.files import FRAME_COLUMNS, RunPlan, brain_file, require_free
 from neuroslam.runs.manifest import copy_saved
 from neuroslam.runs.reading import read_plan
 from neuroslam.runs.results import RunSaver, RunSummary, write_results
+from neuroslam.runs.run import resolve_config
 from neuroslam.runs.saves import final, writing
 from neuroslam.threads import limit_threads, usable_threads
 
@@ -24,28 +27,62 @@ _ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
 """The files of a run with one row per frame, and their content without frames."""
 
 
-def join_brains(
-    loaded: NavigationBrain, partial: NavigationBrain
-) -> tuple[NavigationBrain | None, list[MergeReport]]:
-    """Match and merge two finished maps, then the stored maps of either.
+def join_brains(*brains: NavigationBrain) -> tuple[NavigationBrain | None, list[MergeReport]]:
+    """Match and merge finished maps, then the stored maps of any.
+
+    All pairs are matched; of those that meet, the one with most matched experiences is merged
+    first, then the pairs with the merged map are matched again.
 
     Args:
-        loaded: The brain that is merged into; it is not altered.
-        partial: The brain whose session can be resumed afterwards; it is not altered.
+        *brains: At least two; the ids of the first stay, the session of the last can be resumed
+            afterwards. None is altered.
 
     Returns:
-        The merged brain, or ``None`` if the merge is refused; and a report of each merge, that of
-        the two brains first.
+        The merged brain, or ``None`` if a map meets no other; and a report of each merge of
+        ``brains``, then of the stored maps, or of each refusal.
     """
-    found = find_match(loaded, partial)
+    pool, reports = dict(enumerate(brains)), list[MergeReport]()
+    found: dict[tuple[int, int], Found] = {}
+    while len(pool) > 1:
+        for i, j in combinations(sorted(pool), 2):
+            if (i, j) not in found:
+                found[i, j] = find_match(pool[i], pool[j])
+        refusals: list[MergeReport] = []
+        for i, j in sorted(found, key=lambda pair: -_n_matched(found[pair])):
+            merged, report = _merge_found(pool[i], pool[j], found[i, j])
+            if merged is not None:
+                break
+            refusals.append(report)
+        else:
+            return None, refusals
+        reports.append(report)
+        pool[j] = merged
+        del pool[i]
+        found = {pair: of for pair, of in found.items() if not {i, j} & {*pair}}
+    (merged,) = pool.values()
+    return _join_stored(merged, reports)
+
+
+def _merge_found(
+    loaded: NavigationBrain, partial: NavigationBrain, found: Found
+) -> tuple[NavigationBrain | None, MergeReport]:
     if found.match is None:
-        return None, [_refusal(found.reason, loaded, partial)]
+        return None, _refusal(found.reason, loaded, partial)
     merged, report = loaded.merge(partial, found.match)
     report.found = found.reason
-    reports = [report]
-    if merged is None:
-        return None, reports
-    merged.sessions.merges[-1] = report.to_dict()
+    if merged is not None:
+        merged.sessions.merges[-1] = report.to_dict()
+    return merged, report
+
+
+def _n_matched(found: Found) -> int:
+    return 0 if found.match is None else len(found.match.pairs.partial)
+
+
+def _join_stored(
+    merged: NavigationBrain, reports: list[MergeReport]
+) -> tuple[NavigationBrain, list[MergeReport]]:
+    """Merge the stored maps that are recognised, and relax the result."""
     left = list(merged.stored)
     while left:
         more = _join_one(merged, left)
@@ -93,19 +130,23 @@ def merge_runs(
     second: str | Path,
     out: str | Path,
     *,
+    between: Sequence[str | Path] = (),
     confirm: int | None = None,
+    assignments: Sequence[str] = (),
     overwrite: bool = False,
 ) -> tuple[RunSummary | None, list[MergeReport]]:
-    """Merge two finished sessions and write the files of a run; nothing if the merge is refused.
+    """Merge finished sessions and write the files of a run; nothing if a merge is refused.
 
-    The folder holds the second session on the merged map: its frames are copied, and ``resume``
-    continues it. If the second is only a brain file, there are no frames to write.
+    The folder holds the last session on the merged map: its frames are copied, and ``resume``
+    continues it. If the last is only a brain file, there are no frames to write.
 
     Args:
         first: Run folder or brain file that is merged into; its ids stay.
         second: Run folder or brain file of the session that can be resumed.
         out: Folder to write; made if missing.
+        between: Further run folders or brain files; all maps must become one.
         confirm: Experiences that must agree; default: the config of the second.
+        assignments: Assignments like ``sessions.drift=0.4``, for all maps.
         overwrite: Replace the files of an earlier run in ``out``.
 
     Returns:
@@ -113,30 +154,53 @@ def merge_runs(
 
     Raises:
         CheckpointError: If a brain cannot be loaded.
-        RunError: If ``out`` is one of the two or holds a run already, or cannot be written.
+        ConfigError: If an assignment is invalid, or changes what the maps are made of.
+        RunError: If ``out`` is one of the maps or holds a run already, or cannot be written.
     """
-    out, files = Path(out), [brain_file(path) for path in (first, second)]
+    out, files = Path(out), [brain_file(path) for path in (first, *between, second)]
     brains = [load_brain(file) for file in files]
     for file in files:
         require_free(out, str(file.resolve()), overwrite)
         if file.resolve().parent == out.resolve():
-            raise RunError(f"{out}: holds one of the two maps; choose another folder")
+            raise RunError(f"{out}: holds one of the maps; choose another folder")
     for name in _ROWS:
         if Path(second).is_dir() and not (Path(second) / name).is_file():
             raise RunError(
                 f"{Path(second) / name}: missing; to merge the map without its frames, give "
-                f"{files[1]}"
+                f"{files[-1]}"
             )
-    loaded, partial = brains
     if confirm is not None:
-        sessions = partial.config.sessions.model_copy(update={"confirm": confirm})
-        partial.config = partial.config.model_copy(update={"sessions": sessions})
-    with limit_threads(usable_threads(partial.config.threads)), torch.inference_mode():
-        merged, reports = join_brains(loaded, partial)
+        assignments = [*assignments, f"sessions.confirm={confirm}"]
+    brains = [_reconfigured(brain, assignments) for brain in brains]
+    with limit_threads(usable_threads(brains[-1].config.threads)), torch.inference_mode():
+        merged, reports = join_brains(*brains)
         if merged is None:
             return None, reports
-        plan = replace(_plan_of(second), maps=(str(final(files[0].resolve())),))
+        maps = tuple(str(final(file.resolve())) for file in files[:-1])
+        plan = replace(_plan_of(second), maps=maps)
         return _write(merged, plan, Path(second), files, out, overwrite), reports
+
+
+def _reconfigured(brain: NavigationBrain, assignments: Sequence[str]) -> NavigationBrain:
+    """Return a brain with some parameters of matching and of the map set; itself if none is.
+
+    Raises:
+        ConfigError: If an assignment is invalid, or changes what the map is made of.
+    """
+    if not assignments:
+        return brain
+    for text in assignments:
+        key = text.partition("=")[0].strip()
+        if key != "view.threshold" and key.partition(".")[0] not in ("sessions", "map"):
+            raise ConfigError(
+                f"--set {text}: the maps are made with {key}; a merge can change sessions.*, "
+                "map.* and view.threshold"
+            )
+    config = resolve_config(assignments=tuple(assignments), base=brain.config)
+    changed = NavigationBrain(config)
+    stored = [_reconfigured(one, assignments) for one in brain.stored]
+    changed.restore(brain.state_dict(), stored)
+    return changed
 
 
 def _plan_of(second: str | Path) -> RunPlan:

@@ -209,6 +209,7 @@ class WorldSource(IndexedSource):
     Args:
         name: A name of the :func:`catalogue`.
         options: Options of drive and sensors.
+        world: A world that is not in the catalogue; then ``name`` is free.
 
     Attributes:
         world: Geometry and textures.
@@ -228,9 +229,11 @@ class WorldSource(IndexedSource):
         (201, (80, 160, 3))
     """
 
-    def __init__(self, name: str, options: WorldOptions | None = None) -> None:
+    def __init__(
+        self, name: str, options: WorldOptions | None = None, world: World | None = None
+    ) -> None:
         options = options or WorldOptions()
-        world = build_world(name, options.look)
+        world = build_world(name, options.look) if world is None else world
         if options.route > len(world.routes):
             raise SourceError(
                 f"world {name!r}: route {options.route} does not exist; "

@@ -286,6 +286,65 @@ def test_confirm_says_how_many_places_must_agree(runs, tmp_path, call):
     assert (wrong.code, "--confirm" in wrong.err) == (2, True)
 
 
+def test_parameters_of_matching_can_be_set_and_are_saved(runs, tmp_path, call):
+    out = tmp_path / "out"
+    maps = ("merge", runs / "a", runs / "b", "-o", out)
+    refused = call("merge", runs / "a", runs / "elsewhere", "-o", out)
+    assert "try a larger --set view.threshold" in refused.out
+    done = call(*maps, "--set", "sessions.drift=0.4", "--set", "view.threshold=0.06")
+    assert (done.code, done.err) == (0, "")
+    config = load_brain(out / "brain.safetensors").config
+    assert (config.sessions.drift, config.view.threshold) == (0.4, 0.06)
+    assert call("verify", out).code == 0
+
+
+def test_what_maps_are_made_of_cannot_be_set(runs, tmp_path, mistake):
+    maps = ("merge", runs / "a", runs / "b", "-o", tmp_path / "out")
+    said = mistake(*maps, "--set", "view.template_width=20")
+    assert "a merge can change sessions.*, map.* and view.threshold" in said
+    assert "did you mean 'sessions.drift'" in mistake(*maps, "--set", "sessions.drif=0.4")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- more than two ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chain(runs, tmp_path_factory):
+    """A drive that meets ``b`` and not ``a``."""
+    folder = tmp_path_factory.mktemp("chain")
+    given = ("--start", "230", "--stop", "380", "-o", str(folder / "c"), QUICK)
+    assert main(["run", WORLD, *given]) == 0
+    return folder / "c"
+
+
+def test_of_several_maps_every_pair_is_tried_and_the_best_comes_first(runs, chain, tmp_path, call):
+    """The first of the maps does not meet the third; each of them meets the one between."""
+    maps = [runs / "a", chain, runs / "b"]
+    assert call("merge", maps[0], maps[1], "-o", tmp_path / "two").code == 3
+    done = call("merge", *maps, "-o", tmp_path / "out")
+    assert (done.code, done.err) == (0, "")
+    assert done.out.count("merged: ") == 2
+    agree = [int(n) for n in re.findall(r"(\d+) experiences agree", done.out)]
+    assert agree == sorted(agree, reverse=True)
+    brain = load_brain(tmp_path / "out" / "brain.safetensors")
+    names = {load_brain(m / "brain.safetensors").sessions.now.name for m in maps}
+    assert {session.name for session in brain.sessions.sessions} == names
+    b = load_brain(runs / "b" / "brain.safetensors").sessions.now.name
+    assert brain.sessions.now.name == b  # the last can be resumed
+    assert call("verify", tmp_path / "out").code == 0
+    assert len(read_frames(tmp_path / "out")["frame"]) == 200
+
+
+def test_a_map_of_several_that_meets_no_other_refuses_them_all(runs, tmp_path, call):
+    maps = runs / "a", runs / "elsewhere", runs / "b"
+    done = call("merge", *maps, "-o", tmp_path / "out")
+    assert (done.code, done.err) == (3, "")
+    assert "not merged: no view of one map matches" in done.out
+    assert list(tmp_path.iterdir()) == []
+    assert "two or more" in call("merge", runs / "a", "-o", tmp_path / "out").err
+
+
 # --- mistakes -----------------------------------------------------------------------------------
 
 
