@@ -38,6 +38,7 @@ class ExperienceMap(ExperienceGraph):
     ) -> None:
         super().__init__(config, torus, threshold_cells)
         self._relaxation: Relaxation | None = None  # follows from the links, made when needed
+        self.register_load_state_dict_pre_hook(_forget_links)
 
     def forward(
         self,
@@ -299,15 +300,14 @@ class ExperienceMap(ExperienceGraph):
     def _add_link(self, source: int, target: int, relative_heading_rad: float) -> None:
         s = self.state
         heading = self.experiences.array("pose")[source, 2].item()
-        self.links_table.append(
-            source=source,
-            target=target,
-            distance_m=math.hypot(s.dx_m, s.dy_m),
-            heading_rad=wrap_angle(math.atan2(s.dy_m, s.dx_m) - heading),
-            facing_rad=wrap_angle(s.facing_rad - relative_heading_rad - heading),
-            duration_s=s.since_s,
-        )
-        self._relaxation = None
+        measured = {
+            "distance_m": math.hypot(s.dx_m, s.dy_m),
+            "heading_rad": wrap_angle(math.atan2(s.dy_m, s.dx_m) - heading),
+            "facing_rad": wrap_angle(s.facing_rad - relative_heading_rad - heading),
+        }
+        self.links_table.append(source=source, target=target, duration_s=s.since_s, **measured)
+        if self._relaxation is not None:
+            self._relaxation.add_link(source, target, **measured)
 
     def _arrive(self, experience: int, relative_heading_rad: float) -> None:
         s = self.state
@@ -321,3 +321,8 @@ class ExperienceMap(ExperienceGraph):
         s = self.state
         s.dx_m, s.dy_m = rotate(s.dx_m, s.dy_m, by_rad)
         s.facing_rad = wrap_angle(s.facing_rad + by_rad)
+
+
+def _forget_links(module: ExperienceMap, *_unused: object) -> None:
+    """Drop what follows from the links, as others are loaded."""
+    module._relaxation = None
