@@ -136,13 +136,7 @@ def test_links_passed_over_alter_no_bit(a_map, loops, pushed):
 def test_a_loop_in_a_map_at_rest_is_not_felt_far_from_it():
     n = 400
     poses = np.column_stack([np.arange(n), np.full((n, 2), 0.5)])
-    links = [
-        np.arange(n - 1),
-        np.arange(1, n),
-        np.ones(n - 1),
-        np.full(n - 1, -0.5),
-        np.zeros(n - 1),
-    ]
+    ends, one = (np.arange(n - 1), np.arange(1, n)), np.ones(n - 1)
     relaxation = Relaxation(*ends, one, -0.5 * one, 0.0 * one)
     poses, _ = relaxation.run(poses, 1, 0.5)
     for frame in range(5):
