@@ -97,11 +97,11 @@ def robust_cost(
     """
     cost, r = 0.0, np.empty(3)
     for link in links:
-        square = residual(poses, source[link], target[link], measured, scale, link, r)
+        s, t = int(source[link]), int(target[link])
+        square = residual(poses, s, t, measured, scale, link, r)
         weights[link] = 1.0
         if doubted[link] and square > gate:
-            s = 2.0 * gate / (gate + square)
-            weights[link] = s * s
+            weights[link] = (2.0 * gate / (gate + square)) ** 2
             square = gate * (3.0 * square - gate) / (square + gate)
         cost += square
     return cost
@@ -162,8 +162,9 @@ def poses_that_follow(
             entry = first[v]
             while entry >= 0:
                 link, side = entry // 2, entry % 2
-                residual(poses, ends[0, link], ends[1, link], measured, scale, link, r)
-                jacobians(poses, ends[0, link], ends[1, link], scale, link, jacobian)
+                s, t = int(ends[0, link]), int(ends[1, link])
+                residual(poses, s, t, measured, scale, link, r)
+                jacobians(poses, s, t, scale, link, jacobian)
                 for e in range(9):
                     a, c = e // 3, e % 3
                     slope[a] += weights[link] * jacobian[side, c, a] * r[c]
@@ -397,12 +398,12 @@ def eliminated_step(
     first, following = np.full(n, -1), np.empty(2 * links.size + 32, np.int64)
     r, jacobian = np.empty(3), np.empty((2, 3, 3))
     for link in links:
-        s, t, w = source[link], target[link], weights[link]
+        s, t, w = int(source[link]), int(target[link]), weights[link]
         if w <= 0.0:
             continue
         residual(poses, s, t, measured, scale, link, r)
         jacobians(poses, s, t, scale, link, jacobian)
-        i, j = slot[s], slot[t]
+        i, j = int(slot[s]), int(slot[t])
         for side in range(2):
             at = j if side else i
             if at >= 0:
@@ -481,7 +482,7 @@ def factored_step(
     n, rows, columns, values, right = len(moving), [], [], [], np.zeros(3 * len(links))
     r, jacobian = np.empty(3), np.empty((2, 3, 3))
     for k, link in enumerate(links):
-        s, t, root = source[link], target[link], math.sqrt(max(weights[link], 0.0))
+        s, t, root = int(source[link]), int(target[link]), math.sqrt(max(weights[link], 0.0))
         residual.plain(poses, s, t, measured, scale, link, r)
         jacobians.plain(poses, s, t, scale, link, jacobian)
         right[3 * k : 3 * k + 3] = root * r

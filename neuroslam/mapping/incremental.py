@@ -23,12 +23,19 @@ from scipy.special import chdtri
 from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angles
 from neuroslam.mapping.elimination import links_of, poses_that_follow, robust_cost, step_of
+from neuroslam.mapping.tables import Links, closes_loop
 
 GATE = float(chdtri(3.0, 0.001)) / 3.0
 r""":math:`\Phi`. One correct link in a thousand has a squared residual above :math:`3 \Phi`."""
 
 REJECTED = 0.25
 r"""Weight below which a link counts as rejected: that of :math:`\chi^2 = 3 \Phi`."""
+
+AGREES = 0.0025
+r"""Weight above which a rejected link agrees with another: that of :math:`\chi^2 = 39 \Phi`."""
+
+TOLERANCE = 3e-4
+"""Movement (m, rad) that a pose beside the moving part of the map is spared."""
 
 LINEAR = 0.03
 """Step (m, rad) after which the problem counts as linear: the next would be far smaller."""
@@ -38,6 +45,9 @@ ROUNDS = 60
 
 LEAST_GAIN = 1e-6
 """Relative decrease of the cost below which iteration ends."""
+
+
+NONE = np.zeros(0, np.int64)
 
 
 class UpdateReport(NamedTuple):
@@ -88,7 +98,7 @@ class IncrementalSolver:
         sigma_m: float = 1.0,
         sigma_rad: float = 1.0,
         doubted: np.ndarray | None = None,
-        tolerance: float = 1e-3,
+        tolerance: float = TOLERANCE,
         gate: float = GATE,
     ) -> None:
         self.tolerance, self.gate, self.n = tolerance, gate, 0
@@ -141,12 +151,21 @@ class IncrementalSolver:
 
     def solve(self, poses: np.ndarray) -> UpdateReport:
         """Solve the whole map in place: all poses but the first may move."""
+        self.weigh(poses)
+        report = self._settle(poses, np.arange(1, len(poses)), NONE)
+        tried: set[int] = set()
+        for link in self._rejected().tolist():
+            if link not in tried and self._weights[link] < REJECTED:
+                agreeing = self._agreeing(poses, link)
+                tried.update(agreeing.tolist())
+                if len(agreeing) > 1:  # a single one was tried when it was new
+                    self._reconsider(poses, agreeing)
+        return report
+
+    def weigh(self, poses: np.ndarray) -> None:
+        """Write the weights of all links at these poses."""
         self._check(poses)
         self._weigh(poses, np.arange(self.n))
-        report = self._settle(poses, np.arange(1, len(poses)), np.zeros(0, np.int64))
-        for link in self._rejected():
-            self._reconsider(poses, int(link))
-        return report
 
     def update(self, poses: np.ndarray, since: int) -> UpdateReport:
         """Take in the links from number ``since`` on; move poses in place.
@@ -160,12 +179,14 @@ class IncrementalSolver:
         self._weigh(poses, new)
         contested = new[self._weights[new] < REJECTED]
         agreed = new[self._weights[new] >= REJECTED]
-        report = self._settle(poses, np.unique(self._ends[:, agreed]), np.zeros(0, np.int64))
+        report = self._settle(poses, np.unique(self._ends[:, agreed]), NONE)
         for link in contested.tolist():
             if self._weights[link] < REJECTED:
-                tried = self._reconsider(poses, link)
+                tried = self._reconsider(poses, self._agreeing(poses, link))
                 report = UpdateReport(
-                    np.union1d(report.moved, tried.moved), tried.largest, report.rounds + tried.rounds
+                    np.union1d(report.moved, tried.moved),
+                    tried.largest,
+                    report.rounds + tried.rounds,
                 )
         return report
 
@@ -177,18 +198,14 @@ class IncrementalSolver:
             )
         self._make_poses(len(poses))
 
-    def _columns(self) -> tuple[np.ndarray, ...]:
+    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self._ends[0], self._ends[1], self._measured, self._scale
 
     def _weigh(self, poses: np.ndarray, links: np.ndarray) -> float:
         """Write the weights of these links; return their cost."""
-        return robust_cost(
-            poses, links, *self._columns(), self._doubted, self.gate, self._weights
-        )
+        return robust_cost(poses, links, *self._columns(), self._doubted, self.gate, self._weights)
 
-    def _settle(
-        self, poses: np.ndarray, seeds: np.ndarray, forced: np.ndarray, grows: bool = True
-    ) -> UpdateReport:
+    def _settle(self, poses: np.ndarray, seeds: np.ndarray, forced: np.ndarray) -> UpdateReport:
         """Move the seeds, and what follows them; ``forced`` links are not doubted meanwhile."""
         doubted, slot = self._doubted[forced].copy(), self._slot
         self._doubted[forced] = False
@@ -213,16 +230,15 @@ class IncrementalSolver:
                 continue
             damping = 0.1 * damping if damping > 1e-6 else 0.0
             largest = float(np.abs(step).max())
-            if grows:
-                more = poses_that_follow(
-                    poses, moving, slot, *lists, self._weights, self._measured, self._scale,
-                    self.tolerance,
-                )  # fmt: skip
-                if len(more):
-                    moving = np.concatenate([moving, more])
-                    links = links_of(moving, slot, *lists)
-                    cost = self._weigh(poses, links)
-                    continue
+            more = poses_that_follow(
+                poses, moving, slot, *lists, self._weights, self._measured, self._scale,
+                self.tolerance,
+            )  # fmt: skip
+            if len(more):
+                moving = np.concatenate([moving, more])
+                links = links_of(moving, slot, *lists)
+                cost = self._weigh(poses, links)
+                continue
             if largest <= max(LINEAR, self.tolerance) or cost - lower <= LEAST_GAIN * cost:
                 break
             cost = lower
@@ -232,12 +248,11 @@ class IncrementalSolver:
         self._weigh(poses, links)
         return UpdateReport(moving, largest, rounds)
 
-    def _reconsider(self, poses: np.ndarray, link: int) -> UpdateReport:
-        """Try to believe a rejected link and those that agree with it; keep the cheaper map."""
-        forced = self._agreeing(poses, link)
+    def _reconsider(self, poses: np.ndarray, forced: np.ndarray) -> UpdateReport:
+        """Believe rejected links for a trial; keep the cheaper map."""
         before = poses.copy()
         first = self._settle(poses, np.unique(self._ends[:, forced]), forced)
-        then = self._settle(poses, first.moved, np.zeros(0, np.int64))
+        then = self._settle(poses, first.moved, NONE)
         self._slot[then.moved] = 0
         links = links_of(then.moved, self._slot, self._first, self._following, self._ends)
         self._slot[then.moved] = -1
@@ -247,7 +262,7 @@ class IncrementalSolver:
             self._weigh(poses, links)
             return UpdateReport(then.moved, then.largest, rounds)
         poses[:] = before
-        return UpdateReport(np.zeros(0, np.int64), 0.0, rounds)
+        return UpdateReport(NONE, 0.0, rounds)
 
     def _rejected(self) -> np.ndarray:
         found: np.ndarray = np.flatnonzero(self._weights[: self.n] < REJECTED)
@@ -297,11 +312,26 @@ class IncrementalSolver:
         self._ends, self._following = ends, following
 
 
-AGREES = 0.0025
-r"""Weight above which a rejected link agrees with another: squared residual up to 39 Phi."""
-
-
 def _turned(vectors: np.ndarray, by_rad: float) -> np.ndarray:
     cos, sin = np.cos(by_rad), np.sin(by_rad)
     turned: np.ndarray = vectors @ np.array([[cos, sin], [-sin, cos]])
     return turned
+
+
+def link_weights(poses: np.ndarray, links: Links, sigma_m: float, sigma_rad: float) -> np.ndarray:
+    """Return the weight that each link of a map has at these poses, shape ``(links,)``.
+
+    1 for links that close no loop; below :data:`REJECTED` for those that contradict the map.
+
+    Example:
+        >>> ends = np.array([0, 1, 1]), np.array([1, 2, 0])
+        >>> apart = np.array([1.0, 1.0, 9.0]), np.zeros(3), np.zeros(3)
+        >>> links = Links(*ends, *apart, duration_s=np.ones(3))
+        >>> poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+        >>> (link_weights(poses, links, 0.1, 0.1) < REJECTED).tolist()
+        [False, False, True]
+    """
+    doubted = closes_loop(links.source, links.target)
+    solver = IncrementalSolver(*links[:5], sigma_m=sigma_m, sigma_rad=sigma_rad, doubted=doubted)
+    solver.weigh(poses)
+    return solver.weights

@@ -189,6 +189,7 @@ def run(
             _drive(
                 brain, chain([first], steps), output, recorder, summary, on_step, interrupts, save
             )
+        _end(brain, plan, summary)
         summary.unused = list(opened.unused)
         summary.notes += [note for note in opened.notes if note not in summary.notes]
         return write_results(brain, plan, out, summary)
@@ -261,6 +262,7 @@ def resume(
             recorder = TensorBoardRecorder(out / "events") if tensorboard else NullRecorder()
             save = _saver(brain, plan, out, summary, output, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, interrupts, save)
+        _end(brain, plan, summary)
         summary.unused = list(opened.unused)
         summary.notes += [note for note in opened.notes if note not in summary.notes]
         return write_results(brain, plan, out, summary)
@@ -329,6 +331,12 @@ def _drive(
     # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))
     note_time()
+
+
+def _end(brain: NavigationBrain, plan: RunPlan, summary: RunSummary) -> None:
+    """Solve the whole map once its source has ended; a run that goes on later stays as it is."""
+    if plan.stop is None and not (summary.interrupted or summary.failure):
+        brain.map.solve()
 
 
 def _saver(
