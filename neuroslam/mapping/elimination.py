@@ -203,6 +203,83 @@ def poses_that_follow(
 
 
 @compiled
+def mismatch_over_path(
+    poses: np.ndarray,
+    link: int,
+    least_weight: float,
+    first: np.ndarray,
+    following: np.ndarray,
+    ends: np.ndarray,
+    weights: np.ndarray,
+    measured: np.ndarray,
+    scale: np.ndarray,
+) -> float:
+    r"""Return the squared residual of a link in standard deviations of the shortest path.
+
+    The path between its ends, by links of at least some weight, has the covariance
+    :math:`\sum_k R_k \Sigma_k R_k^\top` and turns by :math:`\sigma_k` about the target of each
+    link k. The map knows its poses better than one path: a residual that is too large here is too
+    large. 0 if no path leads from end to end.
+    """
+    source, goal = int(ends[0, link]), int(ends[1, link])
+    by, queue, n = np.full(first.size, -1), np.empty(first.size, np.int64), 1
+    queue[0], by[source] = source, -2
+    done = 0
+    while done < n and by[goal] == -1:
+        entry = first[queue[done]]
+        while entry >= 0:
+            k, v = entry // 2, ends[1 - entry % 2, entry // 2]
+            if by[v] == -1 and weights[k] >= least_weight and scale[k, 2] > 0.0:
+                by[v] = entry
+                queue[n] = v
+                n += 1
+            entry = following[entry]
+        done += 1
+    if by[goal] == -1:
+        return 0.0
+    covariance = np.zeros((1, 3, 3))
+    at, entry, of_path, w = goal, 2 * link, False, 1.0
+    while True:
+        k = int(entry // 2)
+        s, t = int(ends[0, k]), int(ends[1, k])
+        cos, sin = math.cos(poses[s, 2]), math.sin(poses[s, 2])
+        ahead, aside = 1.0 / (w * scale[k, 0] ** 2), 1.0 / (w * scale[k, 1] ** 2)
+        covariance[0, 0, 0] += cos * cos * ahead + sin * sin * aside
+        covariance[0, 1, 1] += sin * sin * ahead + cos * cos * aside
+        covariance[0, 0, 1] += cos * sin * (ahead - aside)
+        if of_path:
+            turned = 1.0 / (w * scale[k, 2] ** 2)
+            dx, dy = poses[t, 1] - poses[goal, 1], poses[goal, 0] - poses[t, 0]
+            covariance[0, 0, 0] += turned * dx * dx
+            covariance[0, 1, 1] += turned * dy * dy
+            covariance[0, 0, 1] += turned * dx * dy
+            covariance[0, 0, 2] += turned * dx
+            covariance[0, 1, 2] += turned * dy
+            covariance[0, 2, 2] += turned
+            at = ends[entry % 2, k]
+        if at == source:
+            break
+        entry, of_path = by[at], True
+        w = weights[entry // 2]
+    r = np.empty(3)
+    residual(poses, source, goal, measured, scale, link, r)
+    cos, sin = math.cos(poses[source, 2]), math.sin(poses[source, 2])
+    ahead, aside, turn = r[0] / scale[link, 0], r[1] / scale[link, 1], 0.0
+    if scale[link, 2] > 0.0:
+        turn = r[2] / scale[link, 2]
+        covariance[0, 2, 2] += 1.0 / scale[link, 2] ** 2
+    else:
+        covariance[0, 0, 2], covariance[0, 1, 2], covariance[0, 2, 2] = 0.0, 0.0, 1.0
+    _invert(covariance, 0)
+    r[0], r[1], r[2] = cos * ahead - sin * aside, sin * ahead + cos * aside, turn
+    square = 0.0
+    for a in range(3):
+        for b in range(3):
+            square += r[a] * covariance[0, a, b] * r[b]
+    return square
+
+
+@compiled
 def _into_bucket(head: np.ndarray, near: np.ndarray, degree: int, i: int) -> None:
     """Put a pose first among those of this degree."""
     near[0, i], near[1, i] = -1, head[degree]

@@ -22,7 +22,13 @@ from scipy.special import chdtri
 
 from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angles
-from neuroslam.mapping.elimination import links_of, poses_that_follow, robust_cost, step_of
+from neuroslam.mapping.elimination import (
+    links_of,
+    mismatch_over_path,
+    poses_that_follow,
+    robust_cost,
+    step_of,
+)
 from neuroslam.mapping.tables import Links, closes_loop
 
 GATE = float(chdtri(3.0, 0.001)) / 3.0
@@ -33,6 +39,9 @@ r"""Weight below which a link counts as rejected: that of :math:`\chi^2 = 3 \Phi
 
 AGREES = 0.0025
 r"""Weight above which a rejected link agrees with another: that of :math:`\chi^2 = 39 \Phi`."""
+
+GROUPS = tuple(int(3 * 1.5**k) for k in range(20))
+"""Numbers of links that agree with each other at which they are tried against the map again."""
 
 TOLERANCE = 3e-4
 """Movement (m, rad) that a pose beside the moving part of the map is spared."""
@@ -158,7 +167,7 @@ class IncrementalSolver:
             if link not in tried and self._weights[link] < REJECTED:
                 agreeing = self._agreeing(poses, link)
                 tried.update(agreeing.tolist())
-                if len(agreeing) > 1:  # a single one was tried when it was new
+                if len(agreeing) >= GROUPS[0]:  # fewer were tried when they were new
                     self._reconsider(poses, agreeing)
         return report
 
@@ -182,12 +191,11 @@ class IncrementalSolver:
         report = self._settle(poses, np.unique(self._ends[:, agreed]), NONE)
         for link in contested.tolist():
             if self._weights[link] < REJECTED:
-                tried = self._reconsider(poses, self._agreeing(poses, link))
-                report = UpdateReport(
-                    np.union1d(report.moved, tried.moved),
-                    tried.largest,
-                    report.rounds + tried.rounds,
-                )
+                agreeing = self._agreeing(poses, link)
+                if len(agreeing) in GROUPS or self._possible(poses, link):
+                    tried = self._reconsider(poses, agreeing)
+                    moved = np.union1d(report.moved, tried.moved)
+                    report = UpdateReport(moved, tried.largest, report.rounds + tried.rounds)
         return report
 
     def _check(self, poses: np.ndarray) -> None:
@@ -263,6 +271,12 @@ class IncrementalSolver:
             return UpdateReport(then.moved, then.largest, rounds)
         poses[:] = before
         return UpdateReport(NONE, 0.0, rounds)
+
+    def _possible(self, poses: np.ndarray, link: int) -> bool:
+        """Return whether a link could be right, were the map no better than one path through it."""
+        lists = self._first, self._following, self._ends
+        columns = self._weights, self._measured, self._scale
+        return mismatch_over_path(poses, link, REJECTED, *lists, *columns) <= 3.0 * self.gate
 
     def _rejected(self) -> np.ndarray:
         found: np.ndarray = np.flatnonzero(self._weights[: self.n] < REJECTED)
