@@ -43,6 +43,9 @@ r"""Weight above which a rejected link agrees with another: that of :math:`\chi^
 GROUPS = tuple(int(3 * 1.5**k) for k in range(20))
 """Numbers of links that agree with each other at which they are tried against the map again."""
 
+TRIALS = 2
+"""Largest number of trials of one update; a link that is not tried stays rejected for now."""
+
 TOLERANCE = 3e-4
 """Movement (m, rad) that a pose beside the moving part of the map is spared."""
 
@@ -189,13 +192,16 @@ class IncrementalSolver:
         contested = new[self._weights[new] < REJECTED]
         agreed = new[self._weights[new] >= REJECTED]
         report = self._settle(poses, np.unique(self._ends[:, agreed]), NONE)
+        trials = 0
         for link in contested.tolist():
-            if self._weights[link] < REJECTED:
-                agreeing = self._agreeing(poses, link)
-                if len(agreeing) in GROUPS or self._possible(poses, link):
-                    tried = self._reconsider(poses, agreeing)
-                    moved = np.union1d(report.moved, tried.moved)
-                    report = UpdateReport(moved, tried.largest, report.rounds + tried.rounds)
+            if trials == TRIALS or self._weights[link] >= REJECTED:
+                continue
+            agreeing = self._agreeing(poses, link)
+            if len(agreeing) in GROUPS or self._possible(poses, link):
+                trials += 1
+                tried = self._reconsider(poses, agreeing)
+                moved = np.union1d(report.moved, tried.moved)
+                report = UpdateReport(moved, tried.largest, report.rounds + tried.rounds)
         return report
 
     def _check(self, poses: np.ndarray) -> None:
@@ -283,25 +289,32 @@ class IncrementalSolver:
         return found
 
     def _agreeing(self, poses: np.ndarray, link: int) -> np.ndarray:
-        """Return a link and the rejected ones that it would satisfy if it moved the map rigidly."""
+        """Return a link and the rejected ones that agree with it, directly or through others."""
+        group, left, others = [link], [link], self._rejected()
+        others = others[others != link]
+        while left and len(others):
+            agrees = self._satisfied(poses, left.pop(), others)
+            left += others[agrees].tolist()
+            group += others[agrees].tolist()
+            others = others[~agrees]
+        return np.sort(np.array(group))
+
+    def _satisfied(self, poses: np.ndarray, link: int, others: np.ndarray) -> np.ndarray:
+        """Return which other links would be satisfied if a link moved its target's side rigidly."""
         s, t = self._ends[:, link]
-        turn = poses[s, 2] + self._measured[link, 2] - poses[t, 2]
-        if not self._scale[link, 2]:
-            turn = 0.0
-        there = poses[s, :2] + _turned(self._measured[link, :2], poses[s, 2])
-        others = self._rejected()
-        moved = np.concatenate([poses, np.empty((len(others), 3))])
-        ends = self._ends[1, others]
-        moved[len(poses) :, :2] = there + _turned(poses[ends, :2] - poses[t, :2], turn)
-        moved[len(poses) :, 2] = poses[ends, 2] + turn
-        weights = np.empty(len(others))
-        robust_cost(
-            moved, np.arange(len(others)), self._ends[0, others],
-            np.arange(len(poses), len(moved)), self._measured[others], self._scale[others],
-            np.ones(len(others), np.bool_), self.gate, weights,
-        )  # fmt: skip
-        agree = others[weights >= AGREES]
-        return np.union1d(agree, [link])
+        turn = 0.0  # as far as is known
+        if self._scale[link, 2]:
+            turn = poses[s, 2] + self._measured[link, 2] - poses[t, 2]
+        ends, n = poses[self._ends[1, others]], len(others)
+        ends[:, :2] = _turned(ends[:, :2] - poses[t, :2], turn)
+        ends[:, :2] += poses[s, :2] + _turned(self._measured[link, :2], poses[s, 2])
+        ends[:, 2] += turn
+        pairs = np.concatenate([poses[self._ends[0, others]], ends])
+        weights, every = np.empty(n), np.arange(n)
+        columns = every, every, every + n, self._measured[others], self._scale[others]
+        robust_cost(pairs, *columns, np.ones(n, np.bool_), self.gate, weights)
+        satisfied: np.ndarray = weights >= AGREES
+        return satisfied
 
     def _make_poses(self, n: int) -> None:
         if n > len(self._first):
