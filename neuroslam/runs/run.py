@@ -334,8 +334,8 @@ def _drive(
 
 
 def _end(brain: NavigationBrain, plan: RunPlan, summary: RunSummary) -> None:
-    """Solve the whole map once its source has ended; a run that goes on later stays as it is."""
-    if plan.stop is None and not (summary.interrupted or summary.failure):
+    """Solve the whole map once its source has ended; a run that can go on stays as it is."""
+    if summary.added and plan.stop is None and not (summary.interrupted or summary.failure):
         brain.map.solve()
 
 
