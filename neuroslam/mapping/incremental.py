@@ -46,7 +46,7 @@ GROUPS = tuple(int(3 * 1.5**k) for k in range(20))
 TRIALS = 2
 """Largest number of trials of one update; a link that is not tried stays rejected for now."""
 
-TOLERANCE = 3e-4
+TOLERANCE = 1e-4
 """Movement (m, rad) that a pose beside the moving part of the map is spared."""
 
 LINEAR = 0.03
