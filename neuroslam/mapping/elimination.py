@@ -1,67 +1,46 @@
-r"""Sparse block solver for a part of a pose graph: its Gauss-Newton step, by elimination.
+"""Sparse symmetric equations in blocks of 3 by 3: solved by elimination, in the order of degrees.
 
-With the residual :math:`r` and weight :math:`w` of each link as in
-:mod:`~neuroslam.mapping.least_squares`, the step of the poses that may move solves
-
-.. math:: \Bigl(\sum w J^\top J + \lambda \operatorname{diag}\Bigr)\, \delta = -\sum w J^\top r,
-
-while all other poses stay. The matrix has a block of 3 by 3 for each pose and each pair of poses
-that a link joins. Poses are eliminated one by one, always one with fewest neighbours: the
-neighbours of an eliminated pose become neighbours of each other. In a chain nothing is added; in a
-map of laps little.
+Unknowns are eliminated one by one, always one with fewest neighbours, which become neighbours of
+each other. In a chain nothing is added, in a map of laps little.
 """
-
-import math
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from neuroslam import compiled as switch
 from neuroslam.compiled import compiled
-from neuroslam.geometry import TWO_PI
-
-GROUND = 1e-12
-"""Added to the diagonal, of its largest entry: holds what no link holds."""
 
 
-@compiled
-def residual(
-    poses: np.ndarray,
-    s: int,
-    t: int,
-    measured: np.ndarray,
-    scale: np.ndarray,
-    link: int,
-    out: np.ndarray,
-) -> float:
-    """Write the residual of a link in standard deviations; return its square."""
-    cos, sin = math.cos(poses[s, 2]), math.sin(poses[s, 2])
-    dx, dy = poses[t, 0] - poses[s, 0], poses[t, 1] - poses[s, 1]
-    turn = poses[t, 2] - poses[s, 2] - measured[link, 2]
-    turn -= TWO_PI * np.floor((turn + math.pi) / TWO_PI)
-    out[0] = (cos * dx + sin * dy - measured[link, 0]) * scale[link, 0]
-    out[1] = (cos * dy - sin * dx - measured[link, 1]) * scale[link, 1]
-    out[2] = turn * scale[link, 2]
-    return out[0] * out[0] + out[1] * out[1] + out[2] * out[2]
+def factored(
+    diagonal: np.ndarray, slope: np.ndarray, blocks: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+    """Solve block equations: the definition, by scipy's sparse factorisation.
 
+    Args:
+        diagonal: Blocks of the diagonal, shape ``(n, 3, 3)``.
+        slope: Right side, ``(n, 3)``.
+        blocks: Blocks beside the diagonal, ``(blocks, 3, 3)``, one for a pair of unknowns; their
+            transposes are the other half.
+        ends: Row and column of each.
 
-@compiled
-def jacobians(
-    poses: np.ndarray, s: int, t: int, scale: np.ndarray, link: int, out: np.ndarray
-) -> None:
-    """Write the derivatives of a residual by its source and by its target, ``(2, 3, 3)``."""
-    cos, sin = math.cos(poses[s, 2]), math.sin(poses[s, 2])
-    dx, dy = poses[t, 0] - poses[s, 0], poses[t, 1] - poses[s, 1]
-    by_x, by_y, by_turn = scale[link, 0], scale[link, 1], scale[link, 2]
-    out[1, 0, 0], out[1, 0, 1], out[1, 0, 2] = cos * by_x, sin * by_x, 0.0
-    out[1, 1, 0], out[1, 1, 1], out[1, 1, 2] = -sin * by_y, cos * by_y, 0.0
-    out[1, 2, 0], out[1, 2, 1], out[1, 2, 2] = 0.0, 0.0, by_turn
-    for a in range(3):
-        for b in range(3):
-            out[0, a, b] = -out[1, a, b]
-    out[0, 0, 2] = (cos * dy - sin * dx) * by_x
-    out[0, 1, 2] = (-cos * dx - sin * dy) * by_y
+    Returns:
+        The solution, shape ``(n, 3)``.
+
+    Example:
+        >>> one = np.eye(3)[None]
+        >>> factored(4.0 * one, np.ones((1, 3)), one[:0], np.zeros((0, 2), np.int64)).tolist()
+        [[0.25, 0.25, 0.25]]
+    """
+    n, inner = len(slope), np.arange(3)
+    every = np.arange(n)
+    values = np.concatenate([diagonal, blocks, blocks.transpose(0, 2, 1)])
+    at = np.concatenate([np.stack([every, every], axis=1), ends, ends[:, ::-1]])
+    rows = np.broadcast_to(3 * at[:, 0, None, None] + inner[:, None], values.shape)
+    columns = np.broadcast_to(3 * at[:, 1, None, None] + inner, values.shape)
+    places = rows.ravel(), columns.ravel()
+    whole = sparse.csc_array((values.ravel(), places), shape=(3 * n, 3 * n))
+    solution: np.ndarray = splu(whole).solve(slope.ravel())
+    return solution.reshape(-1, 3)
 
 
 @compiled
@@ -76,207 +55,6 @@ def _invert(blocks: np.ndarray, at: int) -> None:
     blocks[at, 0, 1] = blocks[at, 1, 0] = c01 * by
     blocks[at, 0, 2] = blocks[at, 2, 0] = c02 * by
     blocks[at, 1, 2] = blocks[at, 2, 1] = c12 * by
-
-
-@compiled
-def robust_cost(
-    poses: np.ndarray,
-    links: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    measured: np.ndarray,
-    scale: np.ndarray,
-    doubted: np.ndarray,
-    gate: float,
-    weights: np.ndarray,
-) -> float:
-    """Return the robust cost of some links, and write their weights.
-
-    Args as of :class:`~neuroslam.mapping.incremental.IncrementalSolver`; ``doubted``: which links
-    have a weight below 1 if they contradict the others.
-    """
-    cost, r = 0.0, np.empty(3)
-    for k in range(links.size):
-        link = int(links[k])
-        s, t = int(source[link]), int(target[link])
-        square = residual(poses, s, t, measured, scale, link, r)
-        weights[link] = 1.0
-        if doubted[link] and square > gate:
-            weights[link] = (2.0 * gate / (gate + square)) ** 2
-            square = gate * (3.0 * square - gate) / (square + gate)
-        cost += square
-    return cost
-
-
-@compiled
-def links_of(
-    moving: np.ndarray, slot: np.ndarray, first: np.ndarray, following: np.ndarray, ends: np.ndarray
-) -> np.ndarray:
-    """Return the links that end at a moving pose, each once; lists of links as of the solver."""
-    room = 0
-    for i in moving:
-        entry = first[i]
-        while entry >= 0:
-            room += 1
-            entry = following[entry]
-    links, n = np.empty(room, np.int64), 0
-    for i in moving:
-        entry = first[i]
-        while entry >= 0:
-            link, side = entry // 2, entry % 2
-            if side == 0 or slot[ends[0, link]] < 0:  # else found at its source
-                links[n] = link
-                n += 1
-            entry = following[entry]
-    return links[:n]
-
-
-@compiled
-def poses_that_follow(
-    poses: np.ndarray,
-    moving: np.ndarray,
-    slot: np.ndarray,
-    first: np.ndarray,
-    following: np.ndarray,
-    ends: np.ndarray,
-    weights: np.ndarray,
-    measured: np.ndarray,
-    scale: np.ndarray,
-    tolerance: float,
-) -> np.ndarray:
-    """Return poses beside the moving ones that are to move too, and as many beyond them.
-
-    A pose follows if a step of its own, all others held, exceeds the tolerance. With it come the
-    poses around it, so that the moving part of the map doubles; the first pose never moves.
-    """
-    found, n = np.empty(poses.shape[0], np.int64), 0
-    r, jacobian = np.empty(3), np.empty((2, 3, 3))
-    slope, strength = np.empty(3), np.empty(3)
-    for i in moving:
-        outer = first[i]
-        while outer >= 0:
-            v = ends[1 - outer % 2, outer // 2]
-            outer = following[outer]
-            if v == 0 or slot[v] != -1:
-                continue
-            slope[:], strength[:] = 0.0, 0.0
-            entry = first[v]
-            while entry >= 0:
-                link, side = int(entry // 2), entry % 2
-                s, t = int(ends[0, link]), int(ends[1, link])
-                residual(poses, s, t, measured, scale, link, r)
-                jacobians(poses, s, t, scale, link, jacobian)
-                for e in range(9):
-                    a, c = e // 3, e % 3
-                    slope[a] += weights[link] * jacobian[side, c, a] * r[c]
-                    strength[a] += weights[link] * jacobian[side, c, a] ** 2
-                entry = following[entry]
-            follows = False
-            for a in range(3):
-                follows |= abs(slope[a]) > tolerance * strength[a]
-            slot[v] = -3  # looked at
-            if follows:
-                slot[v] = -2
-                found[n] = v
-                n += 1
-    done, most = 0, max(n, moving.size) if n else 0
-    while done < n and n < most:
-        outer = first[found[done]]
-        while outer >= 0 and n < most:
-            v = ends[1 - outer % 2, outer // 2]
-            if v != 0 and (slot[v] == -1 or slot[v] == -3):
-                slot[v] = -2
-                found[n] = v
-                n += 1
-            outer = following[outer]
-        done += 1
-    for i in moving:
-        outer = first[i]
-        while outer >= 0:
-            v = ends[1 - outer % 2, outer // 2]
-            if slot[v] == -3:
-                slot[v] = -1
-            outer = following[outer]
-    for k in range(n):
-        slot[found[k]] = moving.size + k
-    return found[:n]
-
-
-@compiled
-def mismatch_over_path(
-    poses: np.ndarray,
-    link: int,
-    least_weight: float,
-    first: np.ndarray,
-    following: np.ndarray,
-    ends: np.ndarray,
-    weights: np.ndarray,
-    measured: np.ndarray,
-    scale: np.ndarray,
-) -> float:
-    r"""Return the squared residual of a link in standard deviations of the shortest path.
-
-    The path between its ends, by links of at least some weight, has the covariance
-    :math:`\sum_k R_k \Sigma_k R_k^\top` and turns by :math:`\sigma_k` about the target of each
-    link k. The map knows its poses better than one path: a residual that is too large here is too
-    large. 0 if no path leads from end to end.
-    """
-    source, goal = int(ends[0, link]), int(ends[1, link])
-    by, queue, n = np.full(first.size, -1), np.empty(first.size, np.int64), 1
-    queue[0], by[source] = source, -2
-    done = 0
-    while done < n and by[goal] == -1:
-        entry = first[queue[done]]
-        while entry >= 0:
-            k, v = entry // 2, ends[1 - entry % 2, entry // 2]
-            if by[v] == -1 and weights[k] >= least_weight and scale[k, 2] > 0.0:
-                by[v] = entry
-                queue[n] = v
-                n += 1
-            entry = following[entry]
-        done += 1
-    if by[goal] == -1:
-        return 0.0
-    covariance = np.zeros((1, 3, 3))
-    at, entry, of_path, w = goal, 2 * link, False, 1.0
-    while True:
-        k = int(entry // 2)
-        s, t = int(ends[0, k]), int(ends[1, k])
-        cos, sin = math.cos(poses[s, 2]), math.sin(poses[s, 2])
-        ahead, aside = 1.0 / (w * scale[k, 0] ** 2), 1.0 / (w * scale[k, 1] ** 2)
-        covariance[0, 0, 0] += cos * cos * ahead + sin * sin * aside
-        covariance[0, 1, 1] += sin * sin * ahead + cos * cos * aside
-        covariance[0, 0, 1] += cos * sin * (ahead - aside)
-        if of_path:
-            turned = 1.0 / (w * scale[k, 2] ** 2)
-            dx, dy = poses[t, 1] - poses[goal, 1], poses[goal, 0] - poses[t, 0]
-            covariance[0, 0, 0] += turned * dx * dx
-            covariance[0, 1, 1] += turned * dy * dy
-            covariance[0, 0, 1] += turned * dx * dy
-            covariance[0, 0, 2] += turned * dx
-            covariance[0, 1, 2] += turned * dy
-            covariance[0, 2, 2] += turned
-            at = ends[entry % 2, k]
-        if at == source:
-            break
-        entry, of_path = by[at], True
-        w = weights[entry // 2]
-    r = np.empty(3)
-    residual(poses, source, goal, measured, scale, link, r)
-    cos, sin = math.cos(poses[source, 2]), math.sin(poses[source, 2])
-    ahead, aside, turn = r[0] / scale[link, 0], r[1] / scale[link, 1], 0.0
-    if scale[link, 2] > 0.0:
-        turn = r[2] / scale[link, 2]
-        covariance[0, 2, 2] += 1.0 / scale[link, 2] ** 2
-    else:
-        covariance[0, 0, 2], covariance[0, 1, 2], covariance[0, 2, 2] = 0.0, 0.0, 1.0
-    _invert(covariance, 0)
-    r[0], r[1], r[2] = cos * ahead - sin * aside, sin * ahead + cos * aside, turn
-    square = 0.0
-    for a in range(3):
-        for b in range(3):
-            square += r[a] * covariance[0, a, b] * r[b]
-    return square
 
 
 @compiled
@@ -300,32 +78,22 @@ def _out_of_bucket(head: np.ndarray, near: np.ndarray, degree: int, i: int) -> N
 
 
 @compiled
-def _eliminate(
+def eliminate(
     diagonal: np.ndarray,
     slope: np.ndarray,
     blocks: np.ndarray,
     ends: np.ndarray,
-    n_blocks: int,
-    first: np.ndarray,
-    following: np.ndarray,
 ) -> np.ndarray:
-    """Solve the block system; return the solution, shape ``(n, 3)``.
-
-    Args:
-        diagonal: Blocks of the poses, ``(n, 3, 3)``; overwritten, as are the others.
-        slope: Right side, ``(n, 3)``.
-        blocks: Blocks above it, of the pose ``ends[b, 0]`` (row) and ``ends[b, 1]`` (column).
-        ends: Poses of each block, ``(blocks, 2)``; one block for a pair.
-        n_blocks: Number of blocks in use.
-        first: First entry of each pose's list of blocks, -1 for none; entry ``2 b + side`` is block
-            b in the list of ``ends[b, side]``.
-        following: Entry after each.
-    """
+    """Solve as :func:`factored` does, by elimination; the arguments are overwritten."""
     n = slope.shape[0]
+    n_blocks = ends.shape[0]
+    first, following = np.full(n, -1), np.empty(2 * n_blocks, np.int64)
     degree, alive = np.zeros(n, np.int64), np.ones(n, np.bool_)
     for b in range(n_blocks):
-        for side in range(2):
-            degree[ends[b, side]] += 1
+        for side in range(2):  # lists of blocks: entry 2 b + side, as of links
+            i = ends[b, side]
+            following[2 * b + side], first[i] = first[i], 2 * b + side
+            degree[i] += 1
     head, near = np.full(n + 1, -1), np.empty((2, n), np.int64)
     for i in range(n - 1, -1, -1):
         _into_bucket(head, near, int(degree[i]), i)
@@ -437,155 +205,7 @@ def _longer(
     blocks: np.ndarray, ends: np.ndarray, following: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return copies with twice the room."""
-    n = ends.shape[0]
-    more = np.empty((2 * n, 3, 3)), np.empty((2 * n, 2), np.int64), np.empty(4 * n, np.int64)
+    n, room = ends.shape[0], 2 * ends.shape[0] + 16
+    more = np.empty((room, 3, 3)), np.empty((room, 2), np.int64), np.empty(2 * room, np.int64)
     more[0][:n], more[1][:n], more[2][: 2 * n] = blocks, ends, following
     return more
-
-
-@compiled
-def _block_between(
-    first: np.ndarray, following: np.ndarray, ends: np.ndarray, i: int, j: int
-) -> int:
-    """Return the block of two poses, -1 if there is none yet."""
-    entry = first[i]
-    while entry >= 0:
-        if ends[entry // 2, 1 - entry % 2] == j:
-            return int(entry // 2)
-        entry = following[entry]
-    return -1
-
-
-@compiled
-def eliminated_step(
-    poses: np.ndarray,
-    moving: np.ndarray,
-    slot: np.ndarray,
-    links: np.ndarray,
-    weights: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    measured: np.ndarray,
-    scale: np.ndarray,
-    damping: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the step; arguments and result of :func:`factored_step`."""
-    n, n_blocks = moving.size, 0
-    diagonal, slope = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    blocks, ends = np.empty((links.size + 16, 3, 3)), np.empty((links.size + 16, 2), np.int64)
-    first, following = np.full(n, -1), np.empty(2 * links.size + 32, np.int64)
-    r, jacobian = np.empty(3), np.empty((2, 3, 3))
-    for k in range(links.size):
-        link = int(links[k])
-        s, t, w = int(source[link]), int(target[link]), weights[link]
-        if w <= 0.0:
-            continue
-        residual(poses, s, t, measured, scale, link, r)
-        jacobians(poses, s, t, scale, link, jacobian)
-        i, j = int(slot[s]), int(slot[t])
-        for side in range(2):
-            at = j if side else i
-            if at >= 0:
-                for e in range(9):
-                    a, b = e // 3, e % 3
-                    if b == 0:
-                        for c in range(3):
-                            slope[at, a] -= w * jacobian[side, c, a] * r[c]
-                    for c in range(3):
-                        diagonal[at, a, b] += w * jacobian[side, c, a] * jacobian[side, c, b]
-        if i >= 0 and j >= 0:
-            block = _block_between(first, following, ends, i, j)
-            if block < 0:
-                block = n_blocks
-                n_blocks += 1
-                ends[block, 0], ends[block, 1] = i, j
-                blocks[block] = 0.0
-                following[2 * block], first[i] = first[i], 2 * block
-                following[2 * block + 1], first[j] = first[j], 2 * block + 1
-            straight = ends[block, 0] == i
-            for e in range(9):
-                a, b, more = e // 3, e % 3, 0.0
-                for c in range(3):
-                    more += w * jacobian[0, c, a] * jacobian[1, c, b]
-                if straight:
-                    blocks[block, a, b] += more
-                else:
-                    blocks[block, b, a] += more
-    strength, largest = np.empty((n, 3)), 0.0
-    for i in range(n):
-        for a in range(3):
-            strength[i, a] = diagonal[i, a, a]
-            largest = max(largest, strength[i, a])
-    for i in range(n):
-        for a in range(3):
-            diagonal[i, a, a] += damping * strength[i, a] + GROUND * max(largest, 1.0)
-    return _eliminate(diagonal, slope, blocks, ends, n_blocks, first, following), strength
-
-
-def factored_step(
-    poses: np.ndarray,
-    moving: np.ndarray,
-    slot: np.ndarray,
-    links: np.ndarray,
-    weights: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    measured: np.ndarray,
-    scale: np.ndarray,
-    damping: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the step of the poses that may move: the definition, by a sparse factorisation.
-
-    Args:
-        poses: x, y and heading, shape ``(n, 3)``.
-        moving: Poses that may move, shape ``(m,)``.
-        slot: For every pose its place in ``moving``, -1 for those that stay.
-        links: Numbers of the links that end at a moving pose, each once.
-        weights: Weight of every link.
-        source: Pose at which each link begins.
-        target: Pose at which it ends.
-        measured: Displacement (m) and turn (rad) that it measured, shape ``(links, 3)``.
-        scale: Inverse standard deviations of these; 0 for a turn that is not known.
-        damping: Share of the diagonal that is added to it.
-
-    Returns:
-        The step, shape ``(m, 3)``, and the diagonal of the undamped matrix, of the same shape.
-
-    Example:
-        >>> ends, far = (np.array([0]), np.array([1])), np.array([[2.0, 0.0, 0.0]])
-        >>> poses, slot, none = np.zeros((2, 3)), np.array([-1, 0]), np.array([0])
-        >>> one = np.array([1]), slot, none, np.ones(1), *ends, far, np.ones((1, 3)), 0.0
-        >>> bool(np.allclose(factored_step(poses, *one)[0], [[2.0, 0.0, 0.0]]))
-        True
-    """
-    n, rows, columns, values, right = len(moving), [], [], [], np.zeros(3 * len(links))
-    r, jacobian = np.empty(3), np.empty((2, 3, 3))
-    for k, link in enumerate(links.tolist()):
-        s, t, root = int(source[link]), int(target[link]), math.sqrt(max(weights[link], 0.0))
-        residual.plain(poses, s, t, measured, scale, link, r)
-        jacobians.plain(poses, s, t, scale, link, jacobian)
-        right[3 * k : 3 * k + 3] = root * r
-        for end, by in ((slot[s], jacobian[0]), (slot[t], jacobian[1])):
-            if end >= 0:
-                for a in range(3):
-                    for b in range(3):
-                        rows.append(3 * k + a)
-                        columns.append(3 * end + b)
-                        values.append(root * by[a, b])
-    whole = sparse.csr_array((values, (rows, columns)), shape=(3 * len(links), 3 * n))
-    normal = whole.T @ whole
-    strength = normal.diagonal()
-    ground = GROUND * max(strength.max(initial=0.0), 1.0)
-    held = normal + sparse.diags_array(damping * strength + ground)
-    step: np.ndarray = -splu(sparse.csc_array(held)).solve(whole.T @ right)
-    return step.reshape(-1, 3), strength.reshape(-1, 3)
-
-
-def step_of(
-    *args: np.ndarray | float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the step, compiled where steps are; arguments and result of :func:`factored_step`."""
-    step: tuple[np.ndarray, np.ndarray] = (
-        eliminated_step(*args) if switch.ENABLED else factored_step(*args)  # type: ignore[arg-type]
-    )
-    return step

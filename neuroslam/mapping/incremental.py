@@ -20,14 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from neuroslam import compiled as switch
 from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angles
-from neuroslam.mapping.elimination import (
+from neuroslam.mapping.elimination import eliminate, factored
+from neuroslam.mapping.pose_graph import (
     links_of,
     mismatch_over_path,
+    normal_equations,
     poses_that_follow,
     robust_cost,
-    step_of,
 )
 from neuroslam.mapping.tables import Links, closes_loop
 
@@ -230,8 +232,9 @@ class IncrementalSolver:
         cost, damping, largest, rounds = self._weigh(poses, links), 0.0, 0.0, 0
         while len(moving) and rounds < ROUNDS:
             rounds += 1
-            args = moving, slot, links, self._weights, *self._columns()
-            step, _ = step_of(poses, *args, damping)
+            args = moving, slot, links, self._weights, *self._columns(), damping
+            *equations, _ = normal_equations(poses, *args)
+            step = eliminate(*equations) if switch.ENABLED else factored(*equations)
             before = poses[moving]
             poses[moving] = before + step
             lower = self._weigh(poses, links)

@@ -3,14 +3,15 @@
 import numpy as np
 
 from neuroslam.mapping.actions import nearest_bound, nearest_bound_of_arrays
-from neuroslam.mapping.elimination import (
-    eliminated_step,
-    factored_step,
+from neuroslam.mapping.elimination import eliminate, factored
+from neuroslam.mapping.incremental import GATE, IncrementalSolver
+from neuroslam.mapping.pose_graph import (
     links_of,
+    mismatch_over_path,
+    normal_equations,
     poses_that_follow,
     robust_cost,
 )
-from neuroslam.mapping.incremental import GATE, IncrementalSolver
 from neuroslam.mapping.relax import Relaxation
 from tests.compiled_cases import case, with_and_without
 
@@ -58,19 +59,22 @@ def _a_graph(draw, n, n_links):
     return poses, moving, slot, weights, source, target, measured, scale
 
 
-@case("mapping.elimination.eliminated_step")
+@case("mapping.pose_graph.normal_equations", "mapping.elimination.eliminate")
 def _steps_of_a_part_of_a_graph(draw):
     graph = _a_graph(draw, draw.integers(2, 25), draw.integers(0, 40))
     poses, moving, slot, weights, *links = graph
     ends = (slot[links[0]] >= 0) | (slot[links[1]] >= 0)
     args = poses, moving, slot, np.flatnonzero(ends), weights, *links, draw.choice([0.01, 1.0])
-    return list(zip(factored_step(*args), eliminated_step(*args), strict=True))
+    expected, found = normal_equations.plain(*args), normal_equations(*args)
+    pairs = list(zip(expected, (part.copy() for part in found), strict=True))
+    return [*pairs, (factored(*expected[:4]), eliminate(*found[:4]))]
 
 
 @case(
-    "mapping.elimination.robust_cost",
-    "mapping.elimination.links_of",
-    "mapping.elimination.poses_that_follow",
+    "mapping.pose_graph.robust_cost",
+    "mapping.pose_graph.links_of",
+    "mapping.pose_graph.poses_that_follow",
+    "mapping.pose_graph.mismatch_over_path",
 )
 def _what_moves_in_a_graph(draw):
     n = draw.integers(2, 40)
@@ -89,13 +93,14 @@ def _what_moves_in_a_graph(draw):
         draw.random(source.size) < 0.5,
     )
 
-    def found(links_of, cost_of, follow):
+    def found(links_of, cost_of, follow, mismatch):
         weights, slots = np.ones(source.size), slot.copy()
         links = links_of(moving, slots, *lists)
         cost = cost_of(poses, links, source, target, measured, scale, doubted, GATE, weights)
         known = solver._measured, solver._scale
         more = follow(poses, moving, slots, *lists, weights, *known, 0.3)
-        return [links, np.array(cost), weights, more, slots]
+        far = mismatch(poses, source.size - 1, 0.25, *lists, weights, *known)
+        return [links, np.array(cost), weights, more, slots, np.array(far)]
 
-    steps = links_of, robust_cost, poses_that_follow
+    steps = links_of, robust_cost, poses_that_follow, mismatch_over_path
     return list(zip(found(*(s.plain for s in steps)), found(*steps), strict=True))

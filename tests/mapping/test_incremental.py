@@ -84,7 +84,7 @@ def test_a_drive_ends_near_the_least_squares_and_a_solution_at_it(seed):
 
 def test_most_updates_move_a_few_poses_and_the_first_never_moves():
     links, loop, _ = laps(600, 4, 150, seed=1)
-    _, poses, reports = driven(links, loop, robust=False)
+    _, poses, reports = driven(links, loop, robust=False, tolerance=1e-3)
     moved = np.array([len(report.moved) for report in reports])
     assert np.median(moved) <= 2
     assert moved[loop].max() > 100  # the first loop closure bends a lap
