@@ -48,16 +48,19 @@ GROUPS = tuple(int(3 * 1.5**k) for k in range(20))
 TRIALS = 2
 """Largest number of trials of one update; a link that is not tried stays rejected for now."""
 
-TOLERANCE = 1e-4
+TOLERANCE = 3e-4
 """Movement (m, rad) that a pose beside the moving part of the map is spared."""
 
 LINEAR = 0.03
 """Step (m, rad) after which the problem counts as linear: the next would be far smaller."""
 
+SOLVED = 1e-6
+"""Step (m, rad) at which the whole map is solved."""
+
 ROUNDS = 60
 """Largest number of steps of one solution."""
 
-LEAST_GAIN = 1e-6
+LEAST_GAIN = 1e-8
 """Relative decrease of the cost below which iteration ends."""
 
 
@@ -166,7 +169,7 @@ class IncrementalSolver:
     def solve(self, poses: np.ndarray) -> UpdateReport:
         """Solve the whole map in place: all poses but the first may move."""
         self.weigh(poses)
-        report = self._settle(poses, np.arange(1, len(poses)), NONE)
+        report = self._settle(poses, np.arange(1, len(poses)), NONE, SOLVED)
         tried: set[int] = set()
         for link in self._rejected().tolist():
             if link not in tried and self._weights[link] < REJECTED:
@@ -221,8 +224,13 @@ class IncrementalSolver:
         """Write the weights of these links; return their cost."""
         return robust_cost(poses, links, *self._columns(), self._doubted, self.gate, self._weights)
 
-    def _settle(self, poses: np.ndarray, seeds: np.ndarray, forced: np.ndarray) -> UpdateReport:
-        """Move the seeds, and what follows them; ``forced`` links are not doubted meanwhile."""
+    def _settle(
+        self, poses: np.ndarray, seeds: np.ndarray, forced: np.ndarray, enough: float = LINEAR
+    ) -> UpdateReport:
+        """Move the seeds, and what follows them, until a step is small enough.
+
+        ``forced`` links are not doubted meanwhile.
+        """
         doubted, slot = self._doubted[forced].copy(), self._slot
         self._doubted[forced] = False
         moving = seeds[seeds > 0]
@@ -256,7 +264,7 @@ class IncrementalSolver:
                 links = links_of(moving, slot, *lists)
                 cost = self._weigh(poses, links)
                 continue
-            if largest <= max(LINEAR, self.tolerance) or cost - lower <= LEAST_GAIN * cost:
+            if largest <= enough or cost - lower <= LEAST_GAIN * cost:
                 break
             cost = lower
         slot[moving] = -1
