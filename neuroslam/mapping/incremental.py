@@ -13,6 +13,8 @@ A new link wakes the poses at its ends. The poses that move take Gauss-Newton st
 stay. A pose beside them that would then move by more than the tolerance joins them, with as many
 around it as move already, until no other would. A new link that contradicts the map is believed if
 the map with it, and with the rejected links that agree with it, costs less than the map without.
+It is tried if one path between its ends would allow it, or if enough links agree with it, and at
+most :data:`TRIALS` are tried in an update.
 """
 
 from typing import NamedTuple
