@@ -17,8 +17,8 @@ import torch
 from benchmarks.timing import Row, written, yardstick_ms
 
 MODULES = (
-    "pose_cells", "view_search", "relaxation", "merge", "arena", "navigation", "ssp", "batches",
-    "end_to_end",
+    "pose_cells", "view_search", "relaxation", "pose_graph", "merge", "arena", "navigation", "ssp",
+    "batches", "end_to_end",
 )  # fmt: skip
 LAST = Path(__file__).with_name("last.json")
 LOSS = 1.15

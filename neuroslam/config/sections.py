@@ -354,10 +354,11 @@ class MapConfig(Section):
     initial_heading_deg: float = Field(
         default=90.0, description="heading of the robot at the start, counter-clockwise from x"
     )
-    solver: Literal["relax", "least_squares"] = Field(
+    solver: Literal["relax", "least_squares", "incremental"] = Field(
         default="relax",
         description="how the map is made consistent; relax: iterative relaxation, Eq. 8 of the "
-        "multisession paper; least_squares: sparse pose-graph optimisation",
+        "multisession paper; least_squares: sparse pose-graph optimisation of the whole map; "
+        "incremental: of the part that moves, and of the whole map at the end of a run",
     )
     correction: float = Field(
         default=0.5,
@@ -382,18 +383,18 @@ class MapConfig(Section):
     sigma_m: float = Field(
         default=0.1,
         gt=0,
-        description="least_squares: standard deviation of a link's position; larger: distances "
-        "count less against headings",
+        description="pose-graph optimisation: standard deviation of a link's position; larger: "
+        "distances count less against headings",
     )
     sigma_rad: float = Field(
         default=0.1,
         gt=0,
-        description="least_squares: standard deviation of a link's heading change; larger: "
-        "headings count less against distances",
+        description="pose-graph optimisation: standard deviation of a link's heading change; "
+        "larger: headings count less against distances",
     )
     robust: bool = Field(
         default=False,
-        description="least_squares: reject loop closures that contradict the other links",
+        description="pose-graph optimisation: reject loop closures that contradict the other links",
     )
 
 

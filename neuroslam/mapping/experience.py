@@ -11,6 +11,7 @@ from neuroslam.errors import MapError
 from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.graph import ExperienceGraph
+from neuroslam.mapping.incremental import IncrementalSolver
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.planning import Plan
 from neuroslam.mapping.relax import Relaxation
@@ -38,6 +39,9 @@ class ExperienceMap(ExperienceGraph):
     ) -> None:
         super().__init__(config, torus, threshold_cells)
         self._relaxation: Relaxation | None = None  # follows from the links, made when needed
+        self._solver: IncrementalSolver | None = None  # likewise
+        self._solved = 0  # links that it has taken in
+        self.register_load_state_dict_pre_hook(_forget_links)
 
     def forward(
         self,
@@ -212,10 +216,18 @@ class ExperienceMap(ExperienceGraph):
         s, c = self.state, self.config
         loops = c.loops if loops is None else loops
         if s.at_rest or not self.links_table.n or not loops:
-            s.largest_correction = 0.0
+            s.largest_correction, self._solved = 0.0, self.links_table.n
             return 0.0
         poses = self.experiences.array("pose")
-        if c.solver == "least_squares":
+        if c.solver == "incremental":
+            solved = poses.copy()
+            if self._solver is None:
+                report = self._incremental_solver().solve(solved)
+            else:
+                report = self._solver.update(solved, self._solved)
+            s.largest_correction = report.largest
+            s.at_rest, self._solved = 1, self.links_table.n
+        elif c.solver == "least_squares":
             links = self.links
             solved, _ = solve_pose_graph(
                 poses,
@@ -240,6 +252,25 @@ class ExperienceMap(ExperienceGraph):
         self._turn_offset(wrap_angle(turned))
         return s.largest_correction
 
+    def solve(self) -> None:
+        """Solve the whole map, if the solver works on parts of it: at the end of a run."""
+        if self.config.solver == "incremental" and self.config.loops:
+            self.state.at_rest, self._solver = 0, None
+            self.relax()
+
+    def _incremental_solver(self) -> IncrementalSolver:
+        """Make the solver for the links that there are, all of them taken in."""
+        c, links = self.config, self.links
+        self._solver = IncrementalSolver(
+            *links[:5],
+            sigma_m=c.sigma_m,
+            sigma_rad=c.sigma_rad,
+            doubted=closes_loop(*links[:2]) if c.robust else None,
+        )
+        self._solver.weigh(self.experiences.array("pose"))
+        self._solved = self.links_table.n
+        return self._solver
+
     def reset_links(self) -> None:
         """Set the links to what the poses say, so that all residuals are 0."""
         links, poses = self.links, self.poses
@@ -251,7 +282,7 @@ class ExperienceMap(ExperienceGraph):
             facing_rad=wrap_angles(moved[:, 2]),
         )
         self.links_table.replace(**{k: torch.from_numpy(v) for k, v in columns._asdict().items()})
-        self._relaxation = None
+        self._relaxation = self._solver = None
 
     def add_goal(self, experience: int, timeout_s: float = math.inf) -> None:
         """Append an experience to visit; drop it when it is reached, or after ``timeout_s``.
@@ -298,16 +329,21 @@ class ExperienceMap(ExperienceGraph):
 
     def _add_link(self, source: int, target: int, relative_heading_rad: float) -> None:
         s = self.state
+        if self.config.solver == "incremental" and self._solver is None and s.at_rest:
+            self._incremental_solver()  # loaded at rest: the new link alone is to be taken in
         heading = self.experiences.array("pose")[source, 2].item()
-        self.links_table.append(
-            source=source,
-            target=target,
-            distance_m=math.hypot(s.dx_m, s.dy_m),
-            heading_rad=wrap_angle(math.atan2(s.dy_m, s.dx_m) - heading),
-            facing_rad=wrap_angle(s.facing_rad - relative_heading_rad - heading),
-            duration_s=s.since_s,
-        )
-        self._relaxation = None
+        measured = {
+            "distance_m": math.hypot(s.dx_m, s.dy_m),
+            "heading_rad": wrap_angle(math.atan2(s.dy_m, s.dx_m) - heading),
+            "facing_rad": wrap_angle(s.facing_rad - relative_heading_rad - heading),
+        }
+        self.links_table.append(source=source, target=target, duration_s=s.since_s, **measured)
+        if self._relaxation is not None:
+            self._relaxation.add_link(source, target, **measured)
+        if self._solver is not None:
+            ends = (self.links_table.array(name) for name in ("source", "target"))
+            doubted = self.config.robust and bool(closes_loop(*ends)[-1])
+            self._solver.add_link(source, target, *measured.values(), doubted=doubted)
 
     def _arrive(self, experience: int, relative_heading_rad: float) -> None:
         s = self.state
@@ -321,3 +357,8 @@ class ExperienceMap(ExperienceGraph):
         s = self.state
         s.dx_m, s.dy_m = rotate(s.dx_m, s.dy_m, by_rad)
         s.facing_rad = wrap_angle(s.facing_rad + by_rad)
+
+
+def _forget_links(module: ExperienceMap, *_unused: object) -> None:
+    """Drop what follows from the links, as others are loaded."""
+    module._relaxation = module._solver = None

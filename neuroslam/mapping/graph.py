@@ -9,6 +9,7 @@ import torch
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import rotate, wrap_angle
+from neuroslam.mapping.incremental import link_weights
 from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.planning import Plan, quickest_path, shortest_path_lengths
 from neuroslam.mapping.tables import (
@@ -207,6 +208,15 @@ class ExperienceGraph(Mergeable):
         return np.hypot(
             dx - links.distance_m * np.cos(direction), dy - links.distance_m * np.sin(direction)
         )
+
+    @property
+    def link_weights(self) -> np.ndarray:
+        """Weight of every link at the present poses, ``(links,)``: 1, less if it contradicts.
+
+        That of the robust incremental solver, whichever solver the map has; see
+        :func:`~neuroslam.mapping.incremental.link_weights`.
+        """
+        return link_weights(self.pose_table, self.links, self.config.sigma_m, self.config.sigma_rad)
 
     def origins(self) -> Origins:
         """Return the origin of every experience, also of those that a merge made part of others."""

@@ -8,6 +8,10 @@ moves all at once and has the wrong sign for links that end at an experience):
           \qquad e = \operatorname{wrap}(\theta_t - \theta_s - f)
 
 and likewise for x and y, where the error is :math:`p_t - p_s - d\,(\cos, \sin)(\theta_s + h)`.
+
+A visit that alters no bit of its ends alters none the next time, unless another link has moved an
+end: such links are passed over, and the map is the same to the last bit. Where most of the map
+moves, no link is passed over, and a loop turns poses while the one before it moves them.
 """
 
 import math
@@ -52,66 +56,25 @@ def relax_sequentially(
     return np.column_stack([x, y, wrap_angles(np.array(theta))])
 
 
-@compiled
-def relax(
-    poses: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    distance_m: np.ndarray,
-    heading_rad: np.ndarray,
-    facing_rad: np.ndarray,
-    loops: int,
-    correction: float,
-    tolerance: float,
-) -> float:
-    """Relax in place, links in the order of visits; return the largest movement of the last loop.
-
-    Headings do not depend on positions, so that each loop turns all poses first. Arguments of
-    :class:`Relaxation` and :meth:`Relaxation.run`.
-    """
-    n, n_links, moved = poses.shape[0], source.size, 0.0
-    bearing, along_x, along_y = np.empty(n_links), np.empty(n_links), np.empty(n_links)
-    x, y, theta, before = np.empty(n), np.empty(n), np.empty(n), np.empty((3, n))
-    for i in range(n):
-        x[i], y[i], theta[i] = poses[i, 0], poses[i, 1], poses[i, 2]
-    for loop in range(loops):
-        for i in range(n):
-            before[0, i], before[1, i], before[2, i] = x[i], y[i], theta[i]
-        for k in range(n_links):
-            s, t, facing = source[k], target[k], facing_rad[k]
-            bearing[k] = theta[s] + heading_rad[k]
-            if facing == facing:  # known
-                turn = theta[t] - theta[s] - facing
-                if not -math.pi <= turn < math.pi:  # rare, and a division
-                    turn -= TWO_PI * np.floor((turn + math.pi) / TWO_PI)
-                theta[s] += correction * turn
-                theta[t] -= correction * turn
-        _displacements(bearing, distance_m, along_x, along_y)
-        for k in range(n_links):
-            s, t = source[k], target[k]
-            error_x = correction * (x[t] - x[s] - along_x[k])
-            error_y = correction * (y[t] - y[s] - along_y[k])
-            x[s] += error_x
-            y[s] += error_y
-            x[t] -= error_x
-            y[t] -= error_y
-        if (loops - 1 - loop) % CHECK_EVERY == 0:
-            moved = 0.0
-            for i in range(n):
-                moved = max(moved, abs(x[i] - before[0, i]))
-                moved = max(moved, abs(y[i] - before[1, i]))
-                turned = theta[i] - before[2, i]
-                moved = max(moved, abs(turned - TWO_PI * np.floor((turned + math.pi) / TWO_PI)))
-            if moved <= tolerance:
-                break
-    for i in range(n):
-        poses[i, 0], poses[i, 1] = x[i], y[i]
-        poses[i, 2] = theta[i] - TWO_PI * np.floor((theta[i] + math.pi) / TWO_PI)
-    return moved
-
-
 CHECK_EVERY = 20
 """Loops between two checks for convergence; the last loop is always checked."""
+
+DENSE = 0.3
+"""Share of links that alter their ends, above which a loop visits all links: that is cheaper."""
+
+
+@compiled
+def _differ(a: float, b: float) -> bool:
+    """Return whether two numbers differ in a bit; a number that is none differs from itself."""
+    return a != b or (a == 0.0 and math.copysign(1.0, a) != math.copysign(1.0, b))
+
+
+@compiled
+def _turned(turn: float) -> float:
+    """Wrap an angle; rarely anything to do, and then a division."""
+    if not -math.pi <= turn < math.pi:
+        turn -= TWO_PI * np.floor((turn + math.pi) / TWO_PI)
+    return turn
 
 
 @compiled
@@ -140,6 +103,175 @@ def _displacements(
         sign = 1.0 - 2.0 * (half - 2.0 * np.floor(0.5 * half))
         along_x[k] = distance[k] * sign * ((1.0 - odd) * c - odd * s)
         along_y[k] = distance[k] * sign * ((1.0 - odd) * s + odd * c)
+
+
+@compiled
+def _fused_loops(
+    pose: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    distance_m: np.ndarray,
+    heading_rad: np.ndarray,
+    facing_rad: np.ndarray,
+    loops: int,
+    correction: float,
+) -> None:
+    """Relax in place, all links in every loop.
+
+    Headings do not depend on positions: the positions of a loop and the headings of the next are
+    done in one pass, so that neither waits for the other. The last target, most often the next
+    source, is kept out of memory.
+    """
+    n_links = source.size
+    bearing, along_x, along_y = np.empty(n_links), np.zeros(n_links), np.zeros(n_links)
+    for loop in range(loops + 1):
+        turns, moves = loop < loops, loop > 0
+        if moves:
+            _displacements(bearing, distance_m, along_x, along_y)
+        last = source[0]
+        x, y, theta = pose[last, 0], pose[last, 1], pose[last, 2]
+        for k in range(n_links):
+            s, t, facing = source[k], target[k], facing_rad[k]
+            if s != last:
+                x, y, theta = pose[s, 0], pose[s, 1], pose[s, 2]
+            to_x, to_y, to_theta = pose[t, 0], pose[t, 1], pose[t, 2]
+            if moves:
+                error_x = correction * (to_x - x - along_x[k])
+                error_y = correction * (to_y - y - along_y[k])
+                pose[s, 0], pose[s, 1] = x + error_x, y + error_y
+                to_x, to_y = to_x - error_x, to_y - error_y
+            if turns:
+                bearing[k] = theta + heading_rad[k]
+                if facing == facing:  # known
+                    turn = correction * _turned(to_theta - theta - facing)
+                    pose[s, 2] = theta + turn
+                    to_theta = to_theta - turn
+            pose[t, 0], pose[t, 1], pose[t, 2] = to_x, to_y, to_theta
+            x, y, theta, last = to_x, to_y, to_theta, t
+
+
+@compiled
+def _tracked_loop(
+    pose: np.ndarray,
+    changed_at: np.ndarray,
+    along: np.ndarray,
+    clock: int,
+    source: np.ndarray,
+    target: np.ndarray,
+    distance_m: np.ndarray,
+    heading_rad: np.ndarray,
+    facing_rad: np.ndarray,
+    correction: float,
+) -> int:
+    """Relax once in place, links only that can alter something; return how many altered an end.
+
+    ``clock`` is the number of visits before this loop; the other arguments as of :func:`relax`.
+    """
+    n_links, n_turned, altered = source.size, 0, 0
+    which, bearing = np.empty(n_links, np.int64), np.empty(n_links)
+    distance, along_x, along_y = np.empty(n_links), np.empty(n_links), np.empty(n_links)
+    for k in range(n_links):
+        s, t, facing = source[k], target[k], facing_rad[k]
+        since = clock + k - n_links  # the last visit of this link
+        if changed_at[1, s] >= since or changed_at[1, t] >= since:
+            theta, to_theta = pose[s, 2], pose[t, 2]
+            which[n_turned], distance[n_turned] = k, distance_m[k]
+            bearing[n_turned] = theta + heading_rad[k]
+            n_turned += 1
+            if facing == facing:  # known
+                turn = correction * _turned(to_theta - theta - facing)
+                pose[s, 2], pose[t, 2] = theta + turn, to_theta - turn
+                if _differ(pose[s, 2], theta):
+                    changed_at[1, s] = clock + k
+                    altered += 1
+                if _differ(pose[t, 2], to_theta):
+                    changed_at[1, t] = clock + k
+    _displacements(bearing[:n_turned], distance[:n_turned], along_x[:n_turned], along_y[:n_turned])
+    for j in range(n_turned):
+        k = which[j]
+        if _differ(along_x[j], along[0, k]) or _differ(along_y[j], along[1, k]):
+            along[0, k], along[1, k] = along_x[j], along_y[j]
+            s = source[k]  # so that this link is visited
+            changed_at[0, s] = max(changed_at[0, s], clock + k - n_links)
+    for k in range(n_links):
+        s, t = source[k], target[k]
+        since = clock + k - n_links
+        if changed_at[0, s] >= since or changed_at[0, t] >= since:
+            x, y, to_x, to_y = pose[s, 0], pose[s, 1], pose[t, 0], pose[t, 1]
+            error_x = correction * (to_x - x - along[0, k])
+            error_y = correction * (to_y - y - along[1, k])
+            pose[s, 0], pose[s, 1] = x + error_x, y + error_y
+            pose[t, 0], pose[t, 1] = to_x - error_x, to_y - error_y
+            if _differ(pose[s, 0], x) or _differ(pose[s, 1], y):
+                changed_at[0, s] = clock + k
+                altered += 1
+            if _differ(pose[t, 0], to_x) or _differ(pose[t, 1], to_y):
+                changed_at[0, t] = clock + k
+    return altered
+
+
+@compiled
+def relax(
+    poses: np.ndarray,
+    pose: np.ndarray,
+    changed_at: np.ndarray,
+    along: np.ndarray,
+    counts: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    distance_m: np.ndarray,
+    heading_rad: np.ndarray,
+    facing_rad: np.ndarray,
+    loops: int,
+    correction: float,
+    tolerance: float,
+) -> float:
+    """Relax in place, links in the order of visits; return the largest movement of the last loop.
+
+    ``poses``, ``loops``, ``correction`` and ``tolerance`` are those of :meth:`Relaxation.run`, the
+    links those of :class:`Relaxation` in the order of visits. The rest is state: ``pose``, the
+    poses at the end of the last call, headings not wrapped; ``changed_at``, shape ``(2, n)``, the
+    visit that last altered the position and the heading of each; ``along``, shape ``(2, links)``,
+    the displacement of each link at its last visit; ``counts``, the visits so far, and how many
+    altered an end in the last loop that counted them.
+    """
+    n, n_links, moved, loop = poses.shape[0], source.size, 0.0, 0
+    for i in range(n):
+        if _differ(pose[i, 0], poses[i, 0]) or _differ(pose[i, 1], poses[i, 1]):
+            changed_at[0, i] = counts[0]
+        if _differ(pose[i, 2], poses[i, 2]):
+            changed_at[1, i] = counts[0]
+    pose[:] = poses
+    before = np.empty_like(pose)
+    while loop < loops:
+        left = (loops - 1 - loop) % CHECK_EVERY  # loops until the next that is checked
+        if left > 0 and counts[1] > 2 * DENSE * n_links:
+            args = source, target, distance_m, heading_rad, facing_rad
+            _fused_loops(pose, *args, left, correction)
+            counts[0] += left * n_links
+            changed_at[:] = counts[0]
+            loop += left
+            left = 0
+        if left == 0:
+            before[:] = pose
+        counts[1] = _tracked_loop(
+            pose, changed_at, along, counts[0],
+            source, target, distance_m, heading_rad, facing_rad, correction,
+        )  # fmt: skip
+        counts[0] += n_links
+        loop += 1
+        if left == 0:
+            moved = 0.0
+            for i in range(n):
+                moved = max(moved, abs(pose[i, 0] - before[i, 0]))
+                moved = max(moved, abs(pose[i, 1] - before[i, 1]))
+                moved = max(moved, abs(_turned(pose[i, 2] - before[i, 2])))
+            if moved <= tolerance:
+                break
+    for i in range(n):
+        poses[i, 0], poses[i, 1] = pose[i, 0], pose[i, 1]
+        poses[i, 2] = pose[i, 2] - TWO_PI * np.floor((pose[i, 2] + math.pi) / TWO_PI)
+    return moved
 
 
 class Relaxation:
@@ -177,6 +309,37 @@ class Relaxation:
             heading_rad[order],
             facing_rad[order],
         )
+        self._pose = np.full((0, 3), np.nan)  # of no pose: all differ
+        self._changed_at = np.zeros((2, 0), np.int64)
+        self._along = np.full((2, len(order)), np.nan)
+        self._counts = np.array([0, 2 * len(order)])
+
+    def add_link(
+        self, source: int, target: int, distance_m: float, heading_rad: float, facing_rad: float
+    ) -> None:
+        """Add one link, the newest; arguments as above.
+
+        Example:
+            >>> relaxation = Relaxation(*(np.array([v]) for v in (0, 1, 1.0, 0.0, 0.0)))
+            >>> relaxation.add_link(1, 2, 1.0, 0.0, 0.0)
+            >>> relaxation.run(np.zeros((3, 3)), loops=1, correction=0.5)[0][:, 0].tolist()
+            [-0.5, -0.25, 0.75]
+        """
+        at = int(np.searchsorted(self._links[0], np.uint64(source), side="right"))
+        new = (np.uint64(source), np.uint64(target), distance_m, heading_rad, facing_rad)
+        columns = [np.insert(c, at, v) for c, v in zip(self._links, new, strict=True)]
+        self._links = columns[0], columns[1], columns[2], columns[3], columns[4]
+        self._along = np.insert(self._along, at, np.nan, axis=1)
+        ends = [end for end in (source, target) if end < len(self._pose)]
+        self._changed_at[:, ends] = self._counts[0]
+
+    def _make_room(self, n: int) -> None:
+        """Keep the state of the poses that there were before; others have changed."""
+        more = n - len(self._pose)
+        if more:
+            self._pose = np.concatenate([self._pose, np.full((more, 3), np.nan)])
+            now = np.full((2, more), self._counts[0])
+            self._changed_at = np.concatenate([self._changed_at, now], axis=1)
 
     def run(
         self, poses: np.ndarray, loops: int, correction: float, tolerance: float = 0.0
@@ -209,4 +372,6 @@ class Relaxation:
                         break
             return poses, moved
         solved = np.array(poses, dtype=np.float64, order="C")
-        return solved, relax(solved, *self._links, loops, correction, tolerance)
+        self._make_room(len(solved))
+        state = self._pose, self._changed_at, self._along, self._counts
+        return solved, relax(solved, *state, *self._links, loops, correction, tolerance)

@@ -198,6 +198,7 @@ def run(
                 due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
                 steps = chain([first], steps)
                 _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
+                _end(brain, plan, summary)
                 _note_source(summary, opened)
                 return write_results(brain, plan, save, summary)
 
@@ -275,6 +276,7 @@ def resume(
             recorder = _recorder(save, tensorboard)
             due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
+            _end(brain, plan, summary)
             _note_source(summary, opened)
             return write_results(brain, plan, save, summary)
 
@@ -352,6 +354,12 @@ def _drive(
     # A resumed run reads the bad frames after its last good one again: count them once.
     summary.skipped = list(dict.fromkeys(summary.skipped))
     note_time()
+
+
+def _end(brain: NavigationBrain, plan: RunPlan, summary: RunSummary) -> None:
+    """Solve the whole map once its source has ended; a run that can go on stays as it is."""
+    if summary.added and plan.stop is None and not (summary.interrupted or summary.failure):
+        brain.map.solve()
 
 
 def _saver(

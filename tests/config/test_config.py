@@ -59,7 +59,7 @@ def test_presets_exist_for_the_published_data():
         ({"view": 3}, r"view = 3: is a section; set one of its keys, as view\.KEY"),
         ({"view": {"crop": [0, 1, 2]}}, r"view\.crop = .*expected four whole numbers x_min"),
         ({"view": {"crop": [0, 1, 2, "x"]}}, r"view\.crop = 'x': expected four whole numbers"),
-        ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax' or"),
+        ({"map": {"solver": "magic"}}, r"map.solver = 'magic': input should be 'relax', 'l"),
         ({"map": {"solver": "relx"}}, r"map.solver = 'relx': .*; did you mean 'relax'\?$"),
         ({"cells": "pose+plase"}, r"unknown population 'plase'; .*; did you mean 'place'\?"),
         ({"veiw": {}}, r"config: unknown key 'veiw'; did you mean 'view'\?$"),

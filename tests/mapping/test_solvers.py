@@ -96,6 +96,57 @@ def test_fast_relaxation_equals_sequential_relaxation(random_map, loops):
     assert differ(fast, slow) < 1e-9
 
 
+@st.composite
+def maps_at_rest_but_for_a_loop(draw):
+    """A chain whose links agree to the last bit, and a loop that bends it; a link added later."""
+    n, rng = draw(st.integers(3, 60)), np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    poses = np.zeros((n, 3))
+    poses[:, 0] = np.arange(n)
+    poses[:, 1:] = draw(st.sampled_from([0.0, 0.25]))  # at 0, movements die out much later
+    chain = [np.arange(n - 1), np.arange(1, n), np.ones(n - 1), np.full(n - 1, -poses[0, 2]),
+             np.zeros(n - 1)]  # fmt: skip
+    loops = [
+        (*rng.choice(n, 2, replace=False), rng.uniform(0, n / 4), *rng.uniform(-0.1, 0.1, 2))
+        for _ in range(2)
+    ]
+    return poses, chain, loops
+
+
+@settings(max_examples=60, deadline=None)
+@given(maps_at_rest_but_for_a_loop(), st.integers(1, 45), st.integers(0, 59))
+def test_links_passed_over_alter_no_bit(a_map, loops, pushed):
+    poses, links, more = a_map
+    relaxation, kept = Relaxation(*links), poses
+    for frame in range(6):
+        if frame in (1, 4):
+            link = more[frame // 3]
+            relaxation.add_link(*link)
+            links = [np.append(column, value) for column, value in zip(links, link, strict=True)]
+        if frame == 3:
+            kept, poses = kept.copy(), poses.copy()
+            kept[pushed % len(poses), :2] += 0.5
+            poses[pushed % len(poses), :2] += 0.5
+        kept, moved = relaxation.run(kept, loops, 0.4)
+        for _ in range(loops):
+            poses, last = Relaxation(*links).run(poses, 1, 0.4)  # knows of no visit: none skipped
+        assert kept.tobytes() == poses.tobytes()
+        assert moved == last
+
+
+def test_a_loop_in_a_map_at_rest_is_not_felt_far_from_it():
+    n = 400
+    poses = np.column_stack([np.arange(n), np.full((n, 2), 0.5)])
+    ends, one = (np.arange(n - 1), np.arange(1, n)), np.ones(n - 1)
+    relaxation = Relaxation(*ends, one, -0.5 * one, 0.0 * one)
+    poses, _ = relaxation.run(poses, 1, 0.5)
+    for frame in range(5):
+        if frame == 1:
+            relaxation.add_link(199, 210, 10.0, -0.5, 0.1)
+        poses, _ = relaxation.run(poses, 10, 0.5)
+        altered = int(relaxation._counts[1])
+        assert altered == 0 if frame == 0 else 0 < altered < 400  # of 1600
+
+
 def test_displacements_are_exact_at_any_angle():
     rng = np.random.default_rng(0)
     bearing = np.concatenate([rng.uniform(-300.0, 300.0, 20_000), np.arange(-40, 41) * np.pi / 4])

@@ -318,6 +318,7 @@ CONFIGS = {
     ),
     "mean gate": BrainConfig(view={"mean_gate": True}),
     "least squares": BrainConfig(map={"solver": "least_squares"}),
+    "incremental": BrainConfig(map={"solver": "incremental", "robust": True}),
 }
 
 

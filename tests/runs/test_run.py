@@ -194,6 +194,22 @@ def test_a_resumed_run_equals_an_uncut_one(whole, cut_copy, tmp_path):
     assert_equal_runs(out, cut_copy)
 
 
+def test_a_map_solved_as_it_grows_resumes_to_the_last_bit_and_is_solved_at_its_end(tmp_path):
+    config = BrainConfig(map={"solver": "incremental", "robust": True})
+    quiet_run(WORLD, tmp_path / "whole", config)
+    quiet_run(WORLD, tmp_path / "cut", config, stop=130)
+    before = load_brain(tmp_path / "cut" / "brain.safetensors").map
+    assert before.n_links >= before.n  # a loop has been closed
+    resume(tmp_path / "cut", tensorboard=False)
+    assert_equal_runs(tmp_path / "whole", tmp_path / "cut")
+    resume(tmp_path / "cut", tensorboard=False)  # nothing is left to do
+    assert_equal_runs(tmp_path / "whole", tmp_path / "cut")
+    ended = load_brain(tmp_path / "whole" / "brain.safetensors").map
+    solved = ended.poses
+    ended.solve()
+    assert np.abs(ended.poses - solved).max() < 1e-4
+
+
 def test_a_run_may_begin_and_be_cut_anywhere(tmp_path):
     quiet_run(WORLD, tmp_path / "whole", start=20, stop=26)
     quiet_run(WORLD, tmp_path / "cut", start=20, stop=21)
