@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from torch import nn
 
 from neuroslam.config import ViewConfig, build_config
 from neuroslam.errors import SourceError
@@ -145,14 +146,15 @@ def _images(path: Path) -> list[np.ndarray]:
     return [frame.image for frame in open_source(path).frames() if frame.image is not None]
 
 
-def match_walks(walks: Walks, view: ViewConfig) -> Matches:
+def match_walks(walks: Walks, view: ViewConfig, network: nn.Module | None = None) -> Matches:
     """Match every query with all references, alone and as the end of a sequence.
 
     Args:
         walks: The images; the truth is not used.
         view: How templates are made; its threshold is not used.
+        network: The network, if ``view.features`` is ``"module"``.
     """
-    cells = LocalViewCells(view)
+    cells = LocalViewCells(view, network)
     for image in walks.references:
         cells.learn(cells.encode(image))
     everything = np.arange(cells.n)
@@ -172,14 +174,17 @@ def match_walks(walks: Walks, view: ViewConfig) -> Matches:
 
 
 def vpr_corridor(
-    data_folder: Path, out_folder: Path, networks: Mapping[str, str | Path] | None = None
+    data_folder: Path,
+    out_folder: Path,
+    networks: Mapping[str, str | Path | nn.Module] | None = None,
 ) -> dict[str, Any]:
     """Recognise an office corridor on a second walk, beside published methods.
 
     Args:
         data_folder: Holds ``images.tar`` and ``truth.json``.
         out_folder: ``results.json`` and ``pr_curves.png`` are written there.
-        networks: Networks to compare too: ``view.features`` -> file of the weights.
+        networks: Networks to compare too: ``view.features`` -> file of the weights; or any name ->
+            a module, as :class:`~neuroslam.view.features.FeatureEncoder` takes it.
 
     Returns:
         The content of ``results.json``: ``rows``, and ``published``.
@@ -193,7 +198,9 @@ def vpr_corridor(
 
 
 def rtabmap_corridor(
-    data_folder: Path, out_folder: Path, networks: Mapping[str, str | Path] | None = None
+    data_folder: Path,
+    out_folder: Path,
+    networks: Mapping[str, str | Path | nn.Module] | None = None,
 ) -> dict[str, Any]:
     """Do the same with the photographs of another corridor, for which nothing is published.
 
@@ -216,17 +223,19 @@ def rtabmap_corridor(
 def _compare(
     walks: Walks,
     out: Path,
-    networks: Mapping[str, str | Path],
+    networks: Mapping[str, str | Path | nn.Module],
     published: Mapping[str, tuple[float, float]],
 ) -> dict[str, Any]:
+    modules = {name: one for name, one in networks.items() if isinstance(one, nn.Module)}
     kinds = KINDS | {
-        name: NETWORK | {"features": name, "weights": str(weights)}
-        for name, weights in networks.items()
+        name: NETWORK
+        | ({"features": "module"} if name in modules else {"features": name, "weights": str(one)})
+        for name, one in networks.items()
     }
     rows: list[dict[str, Any]] = []
     curves: list[PrecisionRecall] = []
     for name, values in kinds.items():
-        found = match_walks(walks, build_config({"view": values}).view)
+        found = match_walks(walks, build_config({"view": values}).view, modules.get(name))
         for frames, at, distance, cost_ms in (
             (1, found.single, found.error, found.single_ms),
             (LENGTH, found.sequence, found.score, found.sequence_ms),
