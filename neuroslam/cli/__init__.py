@@ -17,7 +17,13 @@ from typer.core import TyperGroup
 
 from neuroslam import compiled
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
-from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
+from neuroslam.cli.mapping import (
+    demo_command,
+    localise_command,
+    merge_command,
+    resume_command,
+    run_command,
+)
 from neuroslam.cli.options import with_plugins
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, console, say
 from neuroslam.cli.results import (
@@ -75,6 +81,7 @@ def _options(
 _COMMANDS: dict[str, Callable[..., int]] = {
     "run": run_command,
     "resume": resume_command,
+    "localise": localise_command,
     "merge": merge_command,
     "tune": tune_command,
     "sweep": sweep_command,
