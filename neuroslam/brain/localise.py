@@ -194,8 +194,8 @@ class Localiser:
         self._here = compose(self._here, step)
         self._path_m += abs(velocity.v_m_s) * dt_s
         if self._belief is not None:
-            pose, *rest = self._belief
-            self._belief = (compose(pose, step), *rest)
+            pose, experience, confidence, since_m = self._belief
+            self._belief = compose(pose, step), experience, confidence, since_m
 
     def _estimate(self, frame: Frame) -> tuple[int, float, float, float] | None:
         """Lay the path; return experience, relative heading, mean match error and ratio."""

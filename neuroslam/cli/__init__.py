@@ -35,6 +35,7 @@ from neuroslam.cli.results import (
     plot_command,
     report_command,
     verify_command,
+    why_command,
 )
 from neuroslam.cli.settings import presets_command, tune_command
 from neuroslam.errors import NeuroslamError, RenamedKeyWarning
@@ -82,6 +83,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "run": run_command,
     "resume": resume_command,
     "localise": localise_command,
+    "why": why_command,
     "merge": merge_command,
     "tune": tune_command,
     "sweep": sweep_command,
