@@ -290,7 +290,7 @@ def _draw(
                 clip_on=False,
             )
         left.set(xlim=(0, 1), ylim=(0, 1), xlabel="recall", ylabel="precision")
-        write_title(left, "Matches by their error", f"dashed: 1 frame, line: {LENGTH} frames")
+        write_title(left, "Matches by error", f"dashed: 1 frame; solid: {LENGTH} frames")
         legend_below(left, columns=2)
         _draw_bars(right, rows, published)
     save(figure, path)
