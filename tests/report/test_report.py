@@ -484,3 +484,16 @@ def test_ctrl_c_while_a_page_is_made_leaves_the_old_one(runs, tmp_path):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 130, done.stderr
     assert (out / "report.html").read_text() == "old"
+
+
+def test_the_page_knows_how_far_the_pose_cells_were_where_a_view_matched(tmp_path):
+    run(WORLD, tmp_path / "out", BrainConfig(sessions={"kidnapped": "ignore"}), tensorboard=False)
+    finished = read_run(tmp_path / "out")
+    apart = collect.collect(finished).arrays["row_cells_apart"]
+    action, limit = finished.actions, finished.brain.config.pose_cells.create_threshold_cells
+    assert (action == "link").any()
+    assert (apart[action == "link"] <= limit).all()
+    matched = np.isfinite(apart)
+    new = (action == "create") & (finished.frames["match_error"] > 0.05)
+    assert not matched[new].any()
+    assert (apart[(action == "create") & matched] > limit).all()
