@@ -14,7 +14,6 @@ changes.
 """
 
 from collections import deque
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -121,7 +120,9 @@ class Localiser:
             )
         limits = tolerance([brain.map], brain.config)
         self.place_m, self.drift = limits.place_m, limits.drift
-        self._elsewhere_m = limits.near_m / (2.0 * WINDOW)  # views farther apart are no neighbours'
+        self._elsewhere_m = limits.near_m / (
+            2.0 * WINDOW
+        )  # views beyond it are not similar by proximity
         self.poses = brain.map.poses.copy()
         panoramic = self.config.view.panoramic
         self._turn_scale_m = 0.0 if panoramic else limits.place_m / limits.turn_rad
@@ -289,10 +290,3 @@ class Localiser:
                 )
             self._belief = None
         return Localisation(frame.index, frame.time_s, None, NO_EXPERIENCE, 0.0, error, ratio)
-
-
-def localise(brain: NavigationBrain, frames: Iterator[Frame]) -> Iterator[Localisation]:
-    """Localise frames in a map, see :class:`Localiser`."""
-    localiser = Localiser(brain)
-    for frame in frames:
-        yield localiser(frame)

@@ -164,7 +164,7 @@ def _explain(brain: NavigationBrain, frame: Frame, visited: dict[tuple[int, int]
     )
     old = since_s > RECENT_S
     view, contrast = None, 0.0
-    if frame.image is not None and brain.view.n:
+    if frame.image is not None:
         view, contrast = brain.view.encoder(frame.image)
     n_templates, merges = brain.view.n, len(brain.sessions.merges)
     ids = np.unique(templates[old])

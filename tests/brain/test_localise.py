@@ -2,6 +2,7 @@
 
 import csv
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -48,6 +49,25 @@ def test_the_robot_is_found_where_it_is_within_twenty_frames(brain, start):
             assert apart <= 5
             assert math.dist(one.pose[:2], at[:2]) < 1.0
             assert 0.0 < one.confidence <= 1.0
+
+
+def test_a_panorama_finds_a_robot_that_drives_the_other_way():
+    panorama = "world:corridor?frames_per_lap=110&panoramic=true&grey=true"
+    config = BrainConfig(view={"panoramic": True, "template_width": 64, "template_height": 12})
+    brain = NavigationBrain(config)
+    for frame in open_source(panorama).frames(stop=110):
+        brain(frame)
+    localiser = Localiser(brain)
+    frames = list(open_source(panorama + "&gain=0.9").frames(40, 71))[::-1]
+    for i, (before, frame) in enumerate(pairwise(frames)):
+        v, w = before.velocity  # backwards in time, facing the other way
+        behind = np.roll(frame.image, frame.image.shape[1] // 2, axis=1)
+        back = Frame(i, 0.1 * i, behind, Velocity(v, -w))
+        found = localiser(back)
+    assert found.pose is not None
+    assert abs(int(brain.map.experiences["first_frame"][found.experience]) - 40) <= 5
+    heading = brain.map.poses[found.experience, 2]
+    assert abs(math.remainder(found.pose.theta_rad - heading - math.pi, 2 * math.pi)) < 0.3
 
 
 def test_a_robot_in_another_world_is_not_found(brain):

@@ -45,8 +45,9 @@ def test_a_new_place_is_stopped_by_its_match_error_with_the_number_of_the_run(fo
     assert best.limit == pytest.approx(float(new["match_error"]), abs=1e-9)
 
 
-def test_at_the_start_there_is_nothing_to_return_to(folder):
-    found = why(folder, 10)
+@pytest.mark.parametrize("frame", [0, 10])
+def test_at_the_start_there_is_nothing_to_return_to(folder, frame):
+    found = why(folder, frame)
     assert "'earlier views, of places not visited for 5 s', 0" in found.verdict
     assert (found.candidate, found.experience) == (-1, -1)
     assert found.template is None
