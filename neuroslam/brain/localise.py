@@ -120,13 +120,13 @@ class Localiser:
             )
         limits = tolerance([brain.map], brain.config)
         self.place_m, self.drift = limits.place_m, limits.drift
-        self._elsewhere_m = limits.near_m / (
-            2.0 * WINDOW
-        )  # views beyond it are not similar by proximity
+        # Beyond this distance views are not similar by proximity, as in merging.limits.elsewhere.
+        self._elsewhere_m = limits.near_m / (2.0 * WINDOW)
         self.poses = brain.map.poses.copy()
         panoramic = self.config.view.panoramic
         self._turn_scale_m = 0.0 if panoramic else limits.place_m / limits.turn_rad
-        self._tree = cKDTree(self._coordinates(self.poses[self._own]))
+        self._points = self._coordinates(self.poses[self._own])
+        self._tree = cKDTree(self._points)
         self._odometry = VisualOdometry(self.config.odometry, self.config.view.grey)
         self._path: deque[_Seen] = deque(maxlen=FRAMES)
         self._here, self._path_m = Pose(0.0, 0.0, 0.0), 0.0
@@ -211,8 +211,7 @@ class Localiser:
         near = self._resembling(z, np.ones(len(z), dtype=bool))
         laid = self._lay(near, turns_rad)
         best = int(laid.scores.argmin())
-        points = self._coordinates(self.poses[self._own])
-        apart = np.linalg.norm(points - points[near[best]], axis=1)
+        apart = np.linalg.norm(self._points - self._points[near[best]], axis=1)
         elsewhere = self._resembling(z, apart > self._elsewhere_m)
         ratio = 1.0
         if laid.scores[best] < 0.0:
