@@ -18,7 +18,13 @@ from typer.core import TyperGroup
 
 from neuroslam import compiled
 from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
-from neuroslam.cli.mapping import demo_command, merge_command, resume_command, run_command
+from neuroslam.cli.mapping import (
+    demo_command,
+    localise_command,
+    merge_command,
+    resume_command,
+    run_command,
+)
 from neuroslam.cli.options import with_common_options
 from neuroslam.cli.output import INTERRUPTED, USER_ERROR, complain, console, say
 from neuroslam.cli.results import (
@@ -30,6 +36,7 @@ from neuroslam.cli.results import (
     plot_command,
     report_command,
     verify_command,
+    why_command,
 )
 from neuroslam.cli.settings import presets_command, tune_command
 from neuroslam.errors import NeuroslamError, RenamedKeyWarning, printable, require_utf8
@@ -77,6 +84,8 @@ def _options(
 _COMMANDS: dict[str, Callable[..., int]] = {
     "run": run_command,
     "resume": resume_command,
+    "localise": localise_command,
+    "why": why_command,
     "merge": merge_command,
     "tune": tune_command,
     "sweep": sweep_command,

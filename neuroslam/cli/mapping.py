@@ -117,6 +117,46 @@ def resume_command(
     return _report(summary, out, "resume")
 
 
+def localise_command(
+    stored: Annotated[
+        Path, typer.Argument(metavar="MAP", help="Folder of a run, or its brain file.")
+    ],
+    source: Source,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE.csv", help="File of the poses to write.")
+    ],
+    start: Start = 0,
+    stop: Stop = None,
+    on_bad_frame: BadFrame = OnBadFrame.stop,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier file.")
+    ] = False,
+) -> int:
+    """Localise a SOURCE in a MAP, which is not changed: a pose and a confidence for each frame."""
+    from neuroslam.runs.localise import localise
+
+    summary = localise(
+        stored,
+        source,
+        out,
+        start=start,
+        stop=stop,
+        on_bad_frame=on_bad_frame.value,
+        overwrite=overwrite,
+    )
+    frames = counted(summary.frames, "frame")
+    if summary.first_found is None:
+        say(f"Not found in the map in {frames}")
+    else:
+        again = f", lost {counted(summary.lost, 'time')} since" if summary.lost else ""
+        share = 100 * summary.found / summary.frames
+        say(f"Found at frame {summary.first_found}{again}; {share:.0f} % of {frames} have a pose")
+    if summary.skipped:
+        say(f"Skipped: {counted(len(summary.skipped), 'frame')}, the first: {summary.skipped[0]}")
+    say(f"Written: {out}")
+    return 0
+
+
 def merge_command(
     maps: Annotated[
         list[Path],

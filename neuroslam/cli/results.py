@@ -154,6 +154,37 @@ def plan_command(
     return 0
 
 
+def why_command(
+    path: RunFolder,
+    frame: Annotated[int, typer.Argument(metavar="FRAME", help="Number of a frame of the run.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE.png", help="Picture; default: why_FRAME.png in the run."
+        ),
+    ] = None,
+) -> int:
+    """Explain why a FRAME of a run closed a loop, or which check stopped it."""
+    from neuroslam.runs.why import stored_lines, summary_rows, why
+
+    picture = path / f"why_{frame}.png" if out is None else out
+    found = why(path, frame, picture)
+    say(f"Frame {frame}, action {found.action}. {found.verdict}")
+    table = new_table("check", "value", "limit", "passed")
+    for row in summary_rows(found):
+        table.add_row(*row)
+    say(table)
+    if found.experience >= 0:
+        say(
+            f"The earlier place: template {found.candidate}, experience {found.experience}, "
+            "the nearest with that view in the pose cells"
+        )
+    for line in stored_lines(found):
+        say(line)
+    say(f"Written: {picture}")
+    return 0
+
+
 def evaluate_command(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="Folder of a run, or a TUM file.")],
     truth: Truth = None,

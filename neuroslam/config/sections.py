@@ -160,6 +160,14 @@ class ViewConfig(Section):
         description="standard deviation of grey below which a patch becomes uniform (0.5); larger: "
         "more noise in flat areas is removed",
     )
+    orientations: int = Field(
+        default=0,
+        ge=0,
+        le=36,
+        description="orientations of gradients that a grey template is made of instead of "
+        "brightness, without either normalisation; template_height is this number times the rows "
+        "of cells; more tolerant of light and of small displacements; 0: brightness",
+    )
     min_contrast: float = Field(
         default=0.01,
         ge=0,
@@ -200,6 +208,20 @@ class ViewConfig(Section):
             raise ValueError(
                 f"weights belong to a named network, but features is {self.features}; leave "
                 "weights out, or name the network"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _orientations_divide_the_height(self) -> Self:
+        if self.orientations and self.features != "grey":
+            raise ValueError(
+                f"orientations {self.orientations} are those of grey templates, but features is "
+                f"{self.features}; leave one of them out"
+            )
+        if self.orientations and self.template_height % self.orientations:
+            raise ValueError(
+                f"template_height {self.template_height} is not a multiple of orientations "
+                f"{self.orientations}; it is that number times the rows of cells"
             )
         return self
 

@@ -10,9 +10,13 @@ from neuroslam.errors import RunError, did_you_mean
 
 _SESSIONS = "neuroslam.experiments.multisession"
 
+_RECOGNITION = "neuroslam.experiments.place_recognition"
+
 EXPERIMENTS = {
     "corridor-loops": ("neuroslam.experiments.corridor_loops", "corridor_loops", "tuc_slam"),
     "view-matching": ("neuroslam.experiments.view_matching", "view_matching", "rtabmap_corridor"),
+    "vpr-corridor": (_RECOGNITION, "vpr_corridor", "vpr_corridor"),
+    "rtabmap-corridor": (_RECOGNITION, "rtabmap_corridor", "rtabmap_corridor"),
     "virtual-tour": (_SESSIONS, "virtual_tour", None),
     "virtual-tour-no-shift": (_SESSIONS, "virtual_tour_no_shift", None),
     "lab-tour": (_SESSIONS, "lab_tour", None),

@@ -106,6 +106,7 @@ def _draw_templates(axes: Axes, tuning: Tuning) -> None:
         rows = f"rows {top} to {end}" if end >= 0 else f"rows from {top}" if top else "all rows"
         patch = f", patch {config.patch_radius}" if config.patch_radius else ""
         of = "" if config.features == "grey" else f"{config.features}\n"
+        of = f"{config.orientations} orientations\n" if config.orientations else of
         label = f"{of}{config.template_width} x {config.template_height}, {rows}{patch}"
         seen.setdefault(label, score.average_precision)
     chosen = next(iter(seen))

@@ -18,6 +18,7 @@ from neuroslam.errors import MapError, counted
 from neuroslam.evaluation.trajectory import align
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
+from neuroslam.report.decisions import cells_apart
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.report.rows import config_rows, metric_rows
 from neuroslam.runs.reading import (
@@ -82,6 +83,7 @@ def collect(run: FinishedRun) -> Facts:
         "cells": list(run.brain.config.cells),
         "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
         "threshold": run.brain.config.view.threshold,
+        "create_threshold": run.brain.config.pose_cells.create_threshold_cells,
         "features": run.brain.config.view.features,
         "actions": ACTIONS,
         "summary": _summary(run),
@@ -173,6 +175,9 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
         whole[name] = frames[name]
     for name in ("template", "n_templates", "n_experiences", "n_links"):
         whole[name] = frames[name].astype(np.int32)
+    apart = cells_apart(run)
+    if apart is not None:
+        whole["cells_apart"] = apart
     return {f"row_{name}": column[rows] for name, column in whole.items()}
 
 

@@ -111,10 +111,25 @@ function showNow() {
       ["position", at],
       ["motion", `${run.row_v_m_s[row].toFixed(2)} ${about.unit}/s, ${degrees(run.row_w_rad_s[row])}/s`],
       ["match error", hasViews ? matchMeter(error) : null],
+      ["decision", decision(row)],
       ["pose cells", poses],
       ["so far", `${many(run.row_n_experiences[row], "experience")}, ${many(run.row_n_links[row], "link")}`],
     ]),
   );
+}
+
+// Which check stopped a loop at this frame, or let it pass; `neuroslam why` measures all of them.
+function decision(row) {
+  if (!run.row_cells_apart || run.row_template[row] < 0) return null;
+  const error = run.row_match_error[row], apart = run.row_cells_apart[row], limit = about.create_threshold;
+  const action = about.actions[run.row_action[row]];
+  if (action === "create" && apart !== apart) {
+    return error < 0 ? "no loop: there is no earlier view" : `no loop: match error ${error.toFixed(4)}, expected at most ${about.threshold}`;
+  }
+  const cells = `pose cells ${apart.toFixed(1)} cells from an experience with this view`;
+  if (action === "create") return `no loop: ${cells}, expected at most ${limit}`;
+  if (action === "link" || action === "set") return `known experience: ${cells}, at most ${limit}`;
+  return null;
 }
 
 function matchMeter(error) {

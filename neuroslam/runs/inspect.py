@@ -11,7 +11,7 @@ import numpy as np
 from safetensors import safe_open
 
 from neuroslam.brain import NavigationBrain, load_brain
-from neuroslam.config import BrainConfig
+from neuroslam.config import BrainConfig, ViewConfig
 from neuroslam.errors import RunError, counted
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.files import brain_file, write_text
@@ -155,11 +155,15 @@ def _views(config: BrainConfig) -> list[tuple[str, str]]:
     return [
         (
             "view",
-            f"{view.template_width} x {view.template_height} px of {view.features}, "
+            f"{view.template_width} x {view.template_height} px of {_content(view)}, "
             f"threshold {view.threshold}",
         ),
         ("pose cells", f"{cells.n_xy} x {cells.n_xy} x {cells.n_theta}, {cells.cell_size_m} m"),
     ]
+
+
+def _content(view: ViewConfig) -> str:
+    return f"{view.orientations} orientations" if view.orientations else view.features
 
 
 def _session(session: Session, made: Counter[int], own: Counter[int]) -> str:

@@ -11,7 +11,7 @@ from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.sensors import Source
 from neuroslam.sensors.grey import to_grey
 from neuroslam.types import Frame, GreyRule
-from neuroslam.view.features import FeatureEncoder
+from neuroslam.view.features import Encoder
 from neuroslam.view.preprocess import Encoded
 from neuroslam.view.templates import to_bytes
 
@@ -100,7 +100,7 @@ class Drive:
 def read_drive(
     source: Source,
     stop: int | None = None,
-    encoder: FeatureEncoder | None = None,
+    encoder: Encoder | None = None,
     grey: GreyRule = "luma",
 ) -> Drive:
     """Read a source once and reduce its pictures; unusable frames are left out.
@@ -108,7 +108,7 @@ def read_drive(
     Args:
         source: A recording, not a live source.
         stop: Frame to stop before.
-        encoder: Network that makes the templates; ``None`` for grey templates.
+        encoder: Makes the templates, each once; ``None`` for those of grey levels.
         grey: How colour becomes grey.
 
     Raises:

@@ -25,7 +25,7 @@ from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits, fitting
 from neuroslam.tuning.search import Trial, best_of, consistency_limit, map_frames, score_map
 from neuroslam.tuning.views import ViewScore, best_view, score_views
-from neuroslam.view.features import FeatureEncoder
+from neuroslam.view.features import view_encoder
 
 MIN_REVISITS = 30
 """Fewest revisits for a search: below, a drive holds too little information about its loops."""
@@ -198,7 +198,8 @@ def _tune(
     features: nn.Module | None,
 ) -> Tuning:
     report("reading")
-    encoder = None if config.view.features == "grey" else FeatureEncoder(config.view, features)
+    made_once = config.view.features != "grey" or config.view.orientations > 0
+    encoder = view_encoder(config.view, features) if made_once else None
     drive = read_drive(source, stop, encoder, config.view.grey)
     keys = key_frames(drive)
     report("finding revisits")

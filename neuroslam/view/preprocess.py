@@ -1,4 +1,4 @@
-"""Makes templates of images: grey, crop, block mean, mean and patch normalisation."""
+"""Makes templates of images: crop, grey block means and their normalisation, or gradients."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -13,13 +13,18 @@ from neuroslam.errors import ConfigError
 from neuroslam.sensors.frames import check_image
 from neuroslam.sensors.grey import to_grey
 
+_CELL_PX = 4  # pixels of the reduced image across a cell of gradients
+_SMOOTH_PX, _POOL_PX = 2.0, 2.5  # standard deviations of the blur before and after the gradient
+_FLAT_LEVELS = 1.5  # gradient, in grey levels, of which a cell counts half
+_LARGEST = 0.4  # share of an orientation in a cell from which on it is white
+
 
 class Encoded(NamedTuple):
     """Template of an image.
 
     Attributes:
-        template: Grey in [0, 1], ``float64``, shape ``(template_height, template_width)``.
-        contrast: Standard deviation of the grey view before normalisation.
+        template: In [0, 1], ``float64``, shape ``(template_height, template_width)``.
+        contrast: Standard deviation of the reduced grey view, before normalisation or gradients.
     """
 
     template: np.ndarray
@@ -31,7 +36,7 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
 
     Args:
         image: ``uint8``, ``(h, w)`` grey or ``(h, w, 3)`` RGB.
-        config: Rule of grey, crop, size and normalisation.
+        config: Rule of grey, crop, size, normalisation and orientations.
 
     Raises:
         BadFrame: If the image has another type or shape.
@@ -48,6 +53,11 @@ def encode(image: np.ndarray, config: ViewConfig) -> Encoded:
     check_image(image, "LocalViewCells")
     image = crop(to_grey(image, config.grey), config.crop)
     height, width = config.template_height, config.template_width
+    if config.orientations:
+        view, contrast = oriented_gradients(
+            image, height, width, config.orientations, config.panoramic
+        )
+        return Encoded(view, contrast if config.min_contrast else 1.0)
     if runs_compiled():
         view, contrast = encode_step(
             plain_array(image),
@@ -158,6 +168,62 @@ def _patch_sums(values: np.ndarray, radius: int) -> np.ndarray:
 def _patch_weights(shape: tuple[int, int], radius: int) -> np.ndarray:
     """Return one over the number of pixels of each patch that lie in the view."""
     return 1.0 / _patch_sums(np.ones(shape), radius)
+
+
+def oriented_gradients(
+    image: np.ndarray, height: int, width: int, orientations: int, panoramic: bool = False
+) -> Encoded:
+    r"""Make a template of the orientations of the gradients in each cell of an image.
+
+    .. math:: v_{co} = \min\!\Big(1,\; \frac{h_{co}}{0.4\,(\lVert h_c \rVert + \epsilon)}\Big),
+              \qquad h_{co} = \sum_x w_c(x)\, \lVert \nabla g(x) \rVert\, a_o(x)
+
+    The gradient of a blurred image :math:`g` at :math:`x` is shared by the two nearest of the
+    orientations :math:`o`, which do not tell bright from dark sides (:math:`a_o`), and each cell
+    :math:`c` sums what lies in and around it (:math:`w_c`): histograms of oriented gradients (N.
+    Dalal, B. Triggs, CVPR 2005), normalised per cell and clipped low, so that a template states
+    which orientations are present rather than how strong they are. :math:`\epsilon` is 1.5 grey
+    levels. Brightness and contrast of the light cancel; blur and pooling forgive small shifts in
+    every direction and of scale.
+
+    Args:
+        image: Grey, ``uint8``, ``(h, w)``.
+        height: Rows of the template: ``orientations`` maps of the cells, one below the other.
+        width: Columns of the template, and of the cells.
+        orientations: Number of orientations in half a turn; it divides ``height``.
+        panoramic: The columns wrap around.
+
+    Returns:
+        Template in [0, 1], ``(height, width)``, and contrast of the reduced image.
+
+    Example:
+        >>> stripes = np.tile(np.array([0, 0, 0, 0, 200, 200, 200, 200], np.uint8), (32, 4))
+        >>> found = oriented_gradients(stripes, 8, 4, 2).template
+        >>> found[[0, 4]].tolist()  # across the stripes, and along them
+        [[1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]
+    """
+    rows = height // orientations
+    size = (width * _CELL_PX, rows * _CELL_PX)
+    grey = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    contrast = float(cv2.resize(grey, (width, rows), interpolation=cv2.INTER_AREA).std()) / 255.0
+    wrapped = min(size[0], 4 * _CELL_PX) if panoramic else 0
+    if wrapped:
+        grey = cv2.copyMakeBorder(grey, 0, 0, wrapped, wrapped, cv2.BORDER_WRAP)
+    grey = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
+    across = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)  # differences of two pixels
+    down = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
+    strength, angle = np.hypot(across, down), np.arctan2(down, across)
+    at = angle % np.pi * (orientations / np.pi)
+    pooled = np.empty((orientations, rows, width), np.float32)
+    for o in range(orientations):
+        apart = np.abs(at - o)
+        apart = np.minimum(apart, orientations - apart)
+        part = cv2.GaussianBlur(strength * np.maximum(1.0 - apart, 0.0), (0, 0), _POOL_PX)
+        part = part[:, wrapped : wrapped + size[0]]
+        pooled[o] = cv2.resize(part, (width, rows), interpolation=cv2.INTER_AREA)
+    energy = np.sqrt((pooled * pooled).sum(axis=0)) + _FLAT_LEVELS
+    view = np.minimum(pooled / (_LARGEST * energy), 1.0)
+    return Encoded(view.reshape(height, width).astype(np.float64), contrast)
 
 
 @compiled

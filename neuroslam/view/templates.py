@@ -173,12 +173,21 @@ class LocalViewCells(Mergeable):
         Returns:
             Mean absolute differences in [0, 1], ``(m,)``, of views rounded to bytes.
         """
+        return self.differences_and_turns(view, templates)[0]
+
+    def differences_and_turns(
+        self, view: np.ndarray, templates: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return :meth:`differences`, and present minus learnt heading in radians, ``(m,)``."""
         self._check(view)
         if not len(templates):
-            return np.empty(0)
+            return np.empty(0), np.empty(0)
         pixels = self.templates["pixels"].numpy(force=True)[templates]
-        sums = distances(pixels, to_bytes(view.T), self.geometry).min(axis=0)
-        return np.asarray(sums / (255.0 * self.geometry.n_pixels))
+        sums = distances(pixels, to_bytes(view.T), self.geometry)
+        best = sums.argmin(axis=0)
+        turns = np.array([self._relative_heading(offset) for offset in self.geometry.offsets])
+        errors = sums[best, np.arange(len(best))] / (255.0 * self.geometry.n_pixels)
+        return errors, turns[best]
 
     def search(self, view: np.ndarray, limit: float = np.inf) -> ViewMatch:
         """Find the nearest template, without learning; the lowest id of equally near ones.

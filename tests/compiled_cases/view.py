@@ -9,6 +9,7 @@ from neuroslam.sensors.grey import to_grey
 from neuroslam.view import LocalViewCells
 from neuroslam.view.preprocess import encode
 from neuroslam.view.search import Geometry, distances
+from neuroslam.view.sequence import SequenceMatcher
 from tests.compiled_cases import case, with_and_without
 
 
@@ -94,5 +95,20 @@ def _measure(rng):
         odometry = VisualOdometry(config)
         motions = [odometry(image, 0.1) for image in images]
         return [motions, odometry.speed_sums.numpy(), odometry.turn_sums.numpy()]
+
+    return with_and_without(call)
+
+
+@case("view.sequence.sequence_step")
+def _sequence(rng):
+    ratios = tuple(rng.uniform(-1.5, 2.0, rng.integers(1, 5)))
+    sizes = np.sort(rng.integers(1, 30, 8))
+    rows = [np.where(rng.random(n) < 0.1, np.nan, rng.random(n)) for n in sizes]
+    length = int(rng.integers(1, 6))
+
+    def call():
+        matcher = SequenceMatcher(length, ratios)
+        found = [matcher.scores(row) for row in rows] + [matcher.recent["errors"].numpy().copy()]
+        return [np.nan_to_num(array, nan=9.0, posinf=99.0) for array in found]
 
     return with_and_without(call)

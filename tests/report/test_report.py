@@ -521,3 +521,16 @@ def test_lengths_of_one_camera_alone_are_in_an_arbitrary_unit_everywhere(tmp_pat
     assert metric_rows({"ate_rmse_m": 0.2}, "arbitrary unit") == [
         ["ate rmse", 0.2, "arbitrary unit"]
     ]
+
+
+def test_the_page_knows_how_far_the_pose_cells_were_where_a_view_matched(tmp_path):
+    run(WORLD, tmp_path / "out", BrainConfig(sessions={"kidnapped": "ignore"}), tensorboard=False)
+    finished = read_run(tmp_path / "out")
+    apart = collect.collect(finished).arrays["row_cells_apart"]
+    action, limit = finished.actions, finished.brain.config.pose_cells.create_threshold_cells
+    assert (action == "link").any()
+    assert (apart[action == "link"] <= limit).all()
+    matched = np.isfinite(apart)
+    new = (action == "create") & (finished.frames["match_error"] > 0.05)
+    assert not matched[new].any()
+    assert (apart[(action == "create") & matched] > limit).all()
