@@ -1,0 +1,270 @@
+"""Localisation on the robot's own map by sequences of views, and after a kidnapping."""
+
+from enum import IntEnum
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+
+from neuroslam.config.sequence import SequenceConfig
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, within_links
+from neuroslam.state.join import Join
+from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.tables import GrowingTable, Scalars
+from neuroslam.types import NO_EXPERIENCE, Localisation
+
+_APART = 6
+"""Links within which two experiences count as the same part of the map."""
+
+_AHEAD = 3
+"""Links that the robot may pass in a frame."""
+
+_SUDDEN = 0.75
+"""Change between two frames, as a share of the mean match error, that may be a kidnapping."""
+
+_REACH = {True: (0.5, 6.0), False: (2.0, 12.0)}
+"""Jump on the map that can be an error of odometry and tracking, after a sudden change and without
+one: a share of the way since the robot was localised last, and a number of links."""
+
+
+_SETTLE = 20
+"""Frames that evidence needs to show a kidnapping, beside those in doubt."""
+
+
+class Mode(IntEnum):
+    """What the localiser believes.
+
+    Attributes:
+        EXPLORES: The robot is at places that the map does not know.
+        TRACKS: It is at a known experience.
+        DOUBTS: The view changed abruptly: a bump, or a kidnapping.
+        SEARCHES: It was kidnapped, and looks for itself on its map.
+    """
+
+    EXPLORES = 0
+    TRACKS = 1
+    DOUBTS = 2
+    SEARCHES = 3
+
+
+class _Around(Protocol):
+    """Finds the experiences some links behind and ahead of one."""
+
+    def __call__(self, experience: int, back: int, ahead: int) -> np.ndarray: ...
+
+
+class _State(Scalars):
+    """What is remembered between frames.
+
+    Attributes:
+        mode: A :class:`Mode`.
+        frames: Number of frames in which the robot moved.
+        doubts: Frames since an abrupt change.
+        streak: Frames in a row that agree on ``candidate``.
+        candidate: Experience that the robot may be at.
+        began: Where the candidates of the streak began.
+        passed: Experiences that the candidates have passed since.
+        bad: Frames in a row with too little evidence for the present experience.
+        way_m: Path length since the robot was localised last.
+        localised: 1 once it has been, else 0.
+        since_sudden: Frames since the view changed much between two frames.
+    """
+
+    mode: int
+    frames: int
+    doubts: int
+    streak: int
+    candidate: int
+    began: int
+    passed: int
+    bad: int
+    way_m: float
+    localised: int
+    since_sudden: int
+
+
+class SequenceLocaliser(Mergeable):
+    """Decides from sequences of views where on its own map the robot is.
+
+    :mod:`neuroslam.mapping.sequence` has the recursion. A loop closure is believed if its evidence
+    exceeds ``believe`` and leads over any other part of the map by ``margin``, in
+    ``confirm_frames`` frames in a row that pass ``confirm_experiences`` experiences along the
+    links. While the robot is at known places no experience is made, so that a map of repeated laps
+    stops growing. After an abrupt change of view the robot is first looked for where it was, then
+    on the whole map; only then has a new map to begin.
+
+    Args:
+        config: Limits of the evidence.
+    """
+
+    def __init__(self, config: SequenceConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.memory = 1.0 - 1.0 / config.memory_frames
+        # Of every experience: accumulated cost, and number of the frame that made it.
+        self.evidence = GrowingTable({"cost": ((), torch.float64), "made": ((), torch.int64)})
+        self.state = _State(
+            mode=Mode.EXPLORES, frames=0, doubts=0, streak=0,
+            candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0, bad=0,
+            way_m=0.0, localised=0, since_sudden=0,
+        )  # fmt: skip
+
+    @property
+    def tracks(self) -> bool:
+        """Whether the robot is at known places."""
+        return self.state.mode == Mode.TRACKS
+
+    def merged(self, loaded: State, partial: State, join: Join) -> State:
+        """Forget the evidence, whose ids have changed; every experience is an old one."""
+        n = join.n_experiences + len(join.kept_experiences)
+        costs = partial["evidence.cost"].new_zeros(n)
+        made = partial["evidence.made"].new_full((n,), -self.config.recent_frames)
+        fresh = SequenceLocaliser(self.config).state_dict()
+        merged: State = {name: v for name, v in fresh.items() if name.startswith("state.")}
+        return merged | {"evidence.cost": costs, "evidence.made": made}
+
+    def judge(
+        self,
+        errors: np.ndarray,
+        map_: ExperienceMap,
+        way_m: float,
+        change: float = 0.0,
+        alarm: bool = False,
+    ) -> Localisation:
+        """Take the match errors of a frame into the evidence, and say where the robot is.
+
+        Args:
+            errors: Match error with the view of every experience, ``(n,)``.
+            map_: The robot's own map.
+            way_m: Path length since the last frame, or 1 turn for a metre: a robot at rest adds no
+                evidence.
+            change: Difference of the view from that of the last frame.
+            alarm: Whether the view changed too abruptly for driving.
+        """
+        s, c, current = self.state, self.config, map_.current
+        while self.evidence.n < map_.n:
+            self.evidence.append(cost=0.0, made=s.frames)
+        s.way_m += way_m
+        if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
+            s.mode, s.doubts = Mode.DOUBTS, 0
+            self._forget()
+        if not (way_m or alarm) or not map_.n:
+            return Localisation("at" if self.tracks else "explore", current)
+        s.frames += 1
+        source, target = (map_.links_table.array(name) for name in ("source", "target"))
+        doubting = s.mode >= Mode.DOUBTS
+        old = self.evidence.array("made") <= s.frames - c.recent_frames
+        compared = np.ones(map_.n, dtype=bool) if doubting else old
+        if compared.sum() < c.min_experiences:
+            self._forget()
+            s.mode = Mode.EXPLORES
+            return Localisation("explore", current)
+        s.since_sudden = 0 if change > _SUDDEN * errors[compared].mean() else s.since_sudden + 1
+        relative = relative_errors(errors, compared)
+        costs = advance_costs(self.evidence.array("cost"), relative, source, target, self.memory)
+        self.evidence.array("cost")[:] = costs
+        costs = np.where(compared, costs, UNKNOWN)
+
+        def around(experience: int, back: int, ahead: int) -> np.ndarray:
+            return within_links(experience, back, ahead, source, target, map_.n)
+
+        if doubting:
+            near = around(current, _APART, _APART + s.doubts)
+            return self._doubt(relative[near].min() < -c.keep, costs, around, current)
+        if self.tracks:
+            return self._track(costs, around, map_)
+        best = int(costs.argmin())
+        rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
+        if self._confirmed(best, costs[best], rival, around):
+            kind = self._closing(best, map_)
+            s.mode = Mode.TRACKS
+            return self._go(kind, best, costs[best], rival)
+        return Localisation("explore", current, -costs[best], -rival)
+
+    def _track(self, costs: np.ndarray, around: _Around, map_: ExperienceMap) -> Localisation:
+        """Follow the robot along the links, and notice when it left them."""
+        s, c, current = self.state, self.config, map_.current
+        near = np.flatnonzero(around(current, 1, _AHEAD + 1 + s.bad))
+        here = int(near[costs[near].argmin()])
+        elsewhere = np.where(around(here, _APART, _APART), UNKNOWN, costs)
+        best = int(elsewhere.argmin())
+        s.bad = s.bad + 1 if costs[here] > -c.keep else 0
+        if not s.bad and costs[here] <= elsewhere[best]:
+            s.way_m = 0.0
+        if self._confirmed(best, elsewhere[best], costs[here], around):
+            return self._go(self._closing(best, map_), best, elsewhere[best], costs[here])
+        if s.bad >= c.lost_frames:
+            s.mode, s.bad = Mode.EXPLORES, 0
+            return Localisation("leave", current, -costs[here], -elsewhere[best])
+        return Localisation("at", current if s.bad else here, -costs[here], -elsewhere[best])
+
+    def _doubt(
+        self, familiar: bool, costs: np.ndarray, around: _Around, current: int
+    ) -> Localisation:
+        """Look for the robot where it was, then on the whole map."""
+        s, c = self.state, self.config
+        s.doubts += 1
+        s.bad = s.bad + 1 if familiar else 0
+        if s.bad >= 3:  # frames in a row that show where the robot was
+            return self._resume(current)
+        best = int(costs.argmin())
+        rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
+        if self._confirmed(best, costs[best], rival, around):
+            if around(current, _APART, _APART + s.doubts)[best]:
+                return self._resume(current)
+            s.mode = Mode.TRACKS
+            return self._go("set", best, costs[best], rival)
+        if s.doubts > c.doubt_frames:
+            s.mode = Mode.SEARCHES
+        if s.doubts > c.doubt_frames + c.search_frames:
+            return Localisation("kidnapped", current)
+        return Localisation("wait", current, -costs[best], -rival)
+
+    def _confirmed(self, best: int, cost: float, rival: float, around: _Around) -> bool:
+        """Count frames in a row that agree, along the links, on where the robot is."""
+        s, c = self.state, self.config
+        if not (cost < -c.believe and cost < rival - c.margin):
+            s.streak, s.candidate = 0, NO_EXPERIENCE
+            return False
+        if s.candidate == NO_EXPERIENCE or not around(s.candidate, 1, _AHEAD)[best]:
+            s.streak, s.passed, s.began = 0, 0, best
+        elif best not in (s.candidate, s.began):
+            s.passed += 1
+        s.streak, s.candidate = s.streak + 1, best
+        return s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+
+    def _closing(self, best: int, map_: ExperienceMap) -> Literal["link", "set"]:
+        """Return whether the robot can have driven to an experience since it was localised last."""
+        pose = map_.pose
+        apart = float(np.hypot(*(map_.pose_table[best, :2] - (pose.x_m, pose.y_m))))
+        share, links = _REACH[self.state.since_sudden <= self.config.doubt_frames + _SETTLE]
+        reach = share * self.state.way_m + links * _link_length(map_)
+        return "link" if apart <= reach or not self.state.localised else "set"
+
+    def _go(
+        self, kind: Literal["link", "set"], experience: int, cost: float, rival: float
+    ) -> Localisation:
+        s = self.state
+        s.bad = s.streak = s.doubts = 0
+        s.way_m, s.localised = 0.0, 1
+        s.candidate = NO_EXPERIENCE
+        return Localisation(kind, experience, -float(cost), -float(rival))
+
+    def _resume(self, current: int) -> Localisation:
+        """Go on as before the doubt."""
+        s = self.state
+        s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
+        self._forget()
+        return Localisation("explore", current)
+
+    def _forget(self) -> None:
+        s = self.state
+        self.evidence.array("cost")[:] = 0.0
+        s.streak, s.candidate, s.bad = 0, NO_EXPERIENCE, 0
+
+
+def _link_length(map_: ExperienceMap) -> float:
+    """Return the median length of the links, metres."""
+    lengths = map_.links_table.array("distance_m")
+    return float(np.median(lengths)) if len(lengths) else 0.0
