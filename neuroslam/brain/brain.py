@@ -222,7 +222,8 @@ class NavigationBrain(BrainState):
             self._continue_session(self.sessions.now, "kidnapped")
         here = found.experience
         error = -1.0 if here == NO_EXPERIENCE else float(of_experience[here])
-        unlike = not 0.0 <= error <= self.config.view.threshold
+        limit = self.localiser.new_view or self.config.view.threshold
+        unlike = not 0.0 <= error <= limit
         if found.kind == "leave" or (found.kind == "explore" and unlike):
             return ViewMatch(self.view.learn(view), error, 0.0, True), found
         if found.kind == "wait":

@@ -69,6 +69,8 @@ class _State(Scalars):
         way_m: Path length since the robot was localised last.
         localised: 1 once it has been, else 0.
         since_sudden: Frames since the view changed much between two frames.
+        twin: Experience of another path that may show the same place.
+        twin_frames: Frames in a row that agree on it.
     """
 
     mode: int
@@ -82,6 +84,8 @@ class _State(Scalars):
     way_m: float
     localised: int
     since_sudden: int
+    twin: int
+    twin_frames: int
 
 
 class SequenceLocaliser(Mergeable):
@@ -102,12 +106,14 @@ class SequenceLocaliser(Mergeable):
         super().__init__()
         self.config = config
         self.memory = 1.0 - 1.0 / config.memory_frames
+        self.new_view: float | None = None  # match error of a new view in this frame, where known
         # Of every experience: accumulated cost, and number of the frame that made it.
         self.evidence = GrowingTable({"cost": ((), torch.float64), "made": ((), torch.int64)})
         self.state = _State(
             mode=Mode.EXPLORES, frames=0, doubts=0, streak=0,
             candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0, bad=0,
             way_m=0.0, localised=0, since_sudden=0,
+            twin=NO_EXPERIENCE, twin_frames=0,
         )  # fmt: skip
 
     @property
@@ -156,11 +162,14 @@ class SequenceLocaliser(Mergeable):
         doubting = s.mode >= Mode.DOUBTS
         old = self.evidence.array("made") <= s.frames - c.recent_frames
         compared = np.ones(map_.n, dtype=bool) if doubting else old
+        self.new_view = None
         if compared.sum() < c.min_experiences:
             self._forget()
             s.mode = Mode.EXPLORES
             return Localisation("explore", current)
-        s.since_sudden = 0 if change > _SUDDEN * errors[compared].mean() else s.since_sudden + 1
+        usual = float(errors[compared].mean())
+        self.new_view = c.new_view * usual
+        s.since_sudden = 0 if change > _SUDDEN * usual else s.since_sudden + 1
         relative = relative_errors(errors, compared)
         costs = advance_costs(self.evidence.array("cost"), relative, source, target, self.memory)
         self.evidence.array("cost")[:] = costs
@@ -194,6 +203,8 @@ class SequenceLocaliser(Mergeable):
             s.way_m = 0.0
         if self._confirmed(best, elsewhere[best], costs[here], around):
             return self._go(self._closing(best, map_), best, elsewhere[best], costs[here])
+        if self._is_same_place(best, elsewhere[best], costs[here], around, map_):
+            return self._go("link", best, elsewhere[best], costs[here])
         if s.bad >= c.lost_frames:
             s.mode, s.bad = Mode.EXPLORES, 0
             return Localisation("leave", current, -costs[here], -elsewhere[best])
@@ -233,6 +244,28 @@ class SequenceLocaliser(Mergeable):
             s.passed += 1
         s.streak, s.candidate = s.streak + 1, best
         return s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+
+    def _is_same_place(
+        self, best: int, cost: float, present: float, around: _Around, map_: ExperienceMap
+    ) -> bool:
+        """Return whether two paths of the map, close to each other, have shown one place for long.
+
+        The second was made while the robot was not localised on the first.
+        """
+        s, c = self.state, self.config
+        apart = float(np.hypot(*(map_.pose_table[best, :2] - map_.pose_table[map_.current, :2])))
+        if not (cost < -c.believe and cost < present + c.margin and apart < self._nearby(map_)):
+            s.twin_frames, s.twin = 0, NO_EXPERIENCE
+            return False
+        follows = s.twin != NO_EXPERIENCE and around(s.twin, 1, _AHEAD)[best]
+        s.twin_frames, s.twin = (s.twin_frames + 1 if follows else 0), best
+        if s.twin_frames < c.confirm_frames:
+            return False
+        s.twin_frames, s.twin = 0, NO_EXPERIENCE
+        return True
+
+    def _nearby(self, map_: ExperienceMap) -> float:
+        return 2 * _APART * _link_length(map_)
 
     def _closing(self, best: int, map_: ExperienceMap) -> Literal["link", "set"]:
         """Return whether the robot can have driven to an experience since it was localised last."""

@@ -12,6 +12,14 @@ class SequenceConfig(Section):
     experiences, so that no limit depends on the threshold, the light or the camera.
     """
 
+    new_view: float = Field(
+        default=0.58,
+        gt=0,
+        le=10,
+        description="match error with the present experience, as a share of the mean error with "
+        "all experiences, beyond which a view of unknown ground makes a new one; larger: "
+        "experiences farther apart. With fewer than min_experiences, view.threshold decides",
+    )
     memory_frames: float = Field(
         default=14.0,
         gt=1,
