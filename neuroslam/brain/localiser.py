@@ -17,13 +17,16 @@ from neuroslam.types import NO_EXPERIENCE, Localisation
 _APART = 6
 """Links within which two experiences count as the same part of the map."""
 
+_SHARP = 2
+"""Links from a loop closure within which its last frame has to match best."""
+
 _AHEAD = 3
 """Links that the robot may pass in a frame."""
 
 _SUDDEN = 0.75
 """Change between two frames, as a share of the mean match error, that may be a kidnapping."""
 
-_REACH = {True: (0.5, 6.0), False: (2.0, 12.0)}
+_REACH = {True: (1.0, 0.0), False: (2.0, 12.0)}
 """Jump on the map that can be an error of odometry and tracking, after a sudden change and without
 one: a share of the way since the robot was localised last, and a number of links."""
 
@@ -71,6 +74,8 @@ class _State(Scalars):
         since_sudden: Frames since the view changed much between two frames.
         twin: Experience of another path that may show the same place.
         twin_frames: Frames in a row that agree on it.
+        jumped: Experience that the robot may have been moved to.
+        jump_frames: Frames in a row that agree on it.
     """
 
     mode: int
@@ -86,6 +91,8 @@ class _State(Scalars):
     since_sudden: int
     twin: int
     twin_frames: int
+    jumped: int
+    jump_frames: int
 
 
 class SequenceLocaliser(Mergeable):
@@ -108,12 +115,16 @@ class SequenceLocaliser(Mergeable):
         self.memory = 1.0 - 1.0 / config.memory_frames
         self.new_view: float | None = None  # match error of a new view in this frame, where known
         # Of every experience: accumulated cost, and number of the frame that made it.
-        self.evidence = GrowingTable({"cost": ((), torch.float64), "made": ((), torch.int64)})
+        # The fresh cost counts from the last sudden change of view on.
+        self.evidence = GrowingTable(
+            {"cost": ((), torch.float64), "fresh": ((), torch.float64), "made": ((), torch.int64)}
+        )
         self.state = _State(
             mode=Mode.EXPLORES, frames=0, doubts=0, streak=0,
             candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0, bad=0,
             way_m=0.0, localised=0, since_sudden=0,
             twin=NO_EXPERIENCE, twin_frames=0,
+            jumped=NO_EXPERIENCE, jump_frames=0,
         )  # fmt: skip
 
     @property
@@ -128,7 +139,9 @@ class SequenceLocaliser(Mergeable):
         made = partial["evidence.made"].new_full((n,), -self.config.recent_frames)
         fresh = SequenceLocaliser(self.config).state_dict()
         merged: State = {name: v for name, v in fresh.items() if name.startswith("state.")}
-        return merged | {"evidence.cost": costs, "evidence.made": made}
+        return merged | {
+            "evidence.cost": costs, "evidence.fresh": costs.clone(), "evidence.made": made
+        }  # fmt: skip
 
     def judge(
         self,
@@ -150,7 +163,7 @@ class SequenceLocaliser(Mergeable):
         """
         s, c, current = self.state, self.config, map_.current
         while self.evidence.n < map_.n:
-            self.evidence.append(cost=0.0, made=s.frames)
+            self.evidence.append(cost=0.0, fresh=0.0, made=s.frames)
         s.way_m += way_m
         if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
             s.mode, s.doubts = Mode.DOUBTS, 0
@@ -171,6 +184,11 @@ class SequenceLocaliser(Mergeable):
         self.new_view = c.new_view * usual
         s.since_sudden = 0 if change > _SUDDEN * usual else s.since_sudden + 1
         relative = relative_errors(errors, compared)
+        fresh = self.evidence.array("fresh")
+        if not s.since_sudden:
+            fresh[:] = 0.0
+        memory = min(self.memory, s.since_sudden / (1.0 + s.since_sudden))
+        fresh[:] = advance_costs(fresh, relative, source, target, memory)
         costs = advance_costs(self.evidence.array("cost"), relative, source, target, self.memory)
         self.evidence.array("cost")[:] = costs
         costs = np.where(compared, costs, UNKNOWN)
@@ -180,18 +198,28 @@ class SequenceLocaliser(Mergeable):
 
         if doubting:
             near = around(current, _APART, _APART + s.doubts)
-            return self._doubt(relative[near].min() < -c.keep, costs, around, current)
+            return self._doubt(costs, relative, near, around, current)
         if self.tracks:
-            return self._track(costs, around, map_)
+            return self._track(costs, relative, compared, around, map_)
         best = int(costs.argmin())
         rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
-        if self._confirmed(best, costs[best], rival, around):
+        jump = self._jumped(compared, around, current)
+        if jump != NO_EXPERIENCE:
+            return self._go(self._closing(jump, map_), jump, costs[jump], rival)
+        if self._confirmed(best, costs[best], rival, relative, around):
             kind = self._closing(best, map_)
             s.mode = Mode.TRACKS
             return self._go(kind, best, costs[best], rival)
         return Localisation("explore", current, -costs[best], -rival)
 
-    def _track(self, costs: np.ndarray, around: _Around, map_: ExperienceMap) -> Localisation:
+    def _track(
+        self,
+        costs: np.ndarray,
+        relative: np.ndarray,
+        compared: np.ndarray,
+        around: _Around,
+        map_: ExperienceMap,
+    ) -> Localisation:
         """Follow the robot along the links, and notice when it left them."""
         s, c, current = self.state, self.config, map_.current
         near = np.flatnonzero(around(current, 1, _AHEAD + 1 + s.bad))
@@ -201,8 +229,11 @@ class SequenceLocaliser(Mergeable):
         s.bad = s.bad + 1 if costs[here] > -c.keep else 0
         if not s.bad and costs[here] <= elsewhere[best]:
             s.way_m = 0.0
-        if self._confirmed(best, elsewhere[best], costs[here], around):
+        if self._confirmed(best, elsewhere[best], costs[here], relative, around):
             return self._go(self._closing(best, map_), best, elsewhere[best], costs[here])
+        jump = self._jumped(compared, around, current)
+        if jump != NO_EXPERIENCE:
+            return self._go(self._closing(jump, map_), jump, elsewhere[best], costs[here])
         if self._is_same_place(best, elsewhere[best], costs[here], around, map_):
             return self._go("link", best, elsewhere[best], costs[here])
         if s.bad >= c.lost_frames:
@@ -211,17 +242,22 @@ class SequenceLocaliser(Mergeable):
         return Localisation("at", current if s.bad else here, -costs[here], -elsewhere[best])
 
     def _doubt(
-        self, familiar: bool, costs: np.ndarray, around: _Around, current: int
+        self,
+        costs: np.ndarray,
+        relative: np.ndarray,
+        near: np.ndarray,
+        around: _Around,
+        current: int,
     ) -> Localisation:
         """Look for the robot where it was, then on the whole map."""
         s, c = self.state, self.config
         s.doubts += 1
-        s.bad = s.bad + 1 if familiar else 0
+        s.bad = s.bad + 1 if relative[near].min() < -c.keep else 0
         if s.bad >= 3:  # frames in a row that show where the robot was
             return self._resume(current)
         best = int(costs.argmin())
         rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
-        if self._confirmed(best, costs[best], rival, around):
+        if self._confirmed(best, costs[best], rival, relative, around):
             if around(current, _APART, _APART + s.doubts)[best]:
                 return self._resume(current)
             s.mode = Mode.TRACKS
@@ -232,8 +268,13 @@ class SequenceLocaliser(Mergeable):
             return Localisation("kidnapped", current)
         return Localisation("wait", current, -costs[best], -rival)
 
-    def _confirmed(self, best: int, cost: float, rival: float, around: _Around) -> bool:
-        """Count frames in a row that agree, along the links, on where the robot is."""
+    def _confirmed(
+        self, best: int, cost: float, rival: float, relative: np.ndarray, around: _Around
+    ) -> bool:
+        """Count frames in a row that agree, along the links, on where the robot is.
+
+        The last of them has to show it by itself too: evidence of a sequence lags behind.
+        """
         s, c = self.state, self.config
         if not (cost < -c.believe and cost < rival - c.margin):
             s.streak, s.candidate = 0, NO_EXPERIENCE
@@ -243,7 +284,34 @@ class SequenceLocaliser(Mergeable):
         elif best not in (s.candidate, s.began):
             s.passed += 1
         s.streak, s.candidate = s.streak + 1, best
-        return s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+        enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+        return enough and bool(around(best, _SHARP, _SHARP)[relative.argmin()])
+
+    def _jumped(self, compared: np.ndarray, around: _Around, current: int) -> int:
+        """Return where the robot is after a sudden change of view, or that there is no sign of one.
+
+        Frames since the change fit a path elsewhere, and none near the present experience.
+        """
+        s, c = self.state, self.config
+        if not s.localised or not _SETTLE // 2 <= s.since_sudden <= 3 * _SETTLE:
+            s.jumped, s.jump_frames = NO_EXPERIENCE, 0
+            return NO_EXPERIENCE
+        fresh = np.where(compared, self.evidence.array("fresh"), UNKNOWN)
+        best = int(fresh.argmin())
+        near = around(current, _APART, _APART + s.since_sudden // 2)
+        known = 3.0 * c.margin if self.tracks else c.margin
+        rival = np.where(around(best, _APART, _APART), UNKNOWN, fresh).min()
+        lead = min(fresh[near].min() - known, rival - c.margin) - fresh[best]
+        if near[best] or fresh[best] > -c.believe or lead < 0.0:
+            s.jumped, s.jump_frames = NO_EXPERIENCE, 0
+            return NO_EXPERIENCE
+        follows = s.jumped != NO_EXPERIENCE and around(s.jumped, 1, _AHEAD)[best]
+        s.jumped, s.jump_frames = best, (s.jump_frames + 1 if follows else 0)
+        if s.jump_frames < c.confirm_frames // 3:
+            return NO_EXPERIENCE
+        s.mode = Mode.TRACKS
+        self.evidence.array("cost")[:] = self.evidence.array("fresh")
+        return best
 
     def _is_same_place(
         self, best: int, cost: float, present: float, around: _Around, map_: ExperienceMap
@@ -273,13 +341,14 @@ class SequenceLocaliser(Mergeable):
         apart = float(np.hypot(*(map_.pose_table[best, :2] - (pose.x_m, pose.y_m))))
         share, links = _REACH[self.state.since_sudden <= self.config.doubt_frames + _SETTLE]
         reach = share * self.state.way_m + links * _link_length(map_)
+        self.state.since_sudden = 4 * _SETTLE  # the change is explained
         return "link" if apart <= reach or not self.state.localised else "set"
 
     def _go(
         self, kind: Literal["link", "set"], experience: int, cost: float, rival: float
     ) -> Localisation:
         s = self.state
-        s.bad = s.streak = s.doubts = 0
+        s.bad = s.streak = s.doubts = s.jump_frames = 0
         s.way_m, s.localised = 0.0, 1
         s.candidate = NO_EXPERIENCE
         return Localisation(kind, experience, -float(cost), -float(rival))
