@@ -1,5 +1,6 @@
 """Localisation on the robot's own map by sequences of views, and after a kidnapping."""
 
+from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from typing import Literal, Protocol
 
@@ -17,9 +18,6 @@ from neuroslam.types import NO_EXPERIENCE, Localisation
 _APART = 6
 """Links within which two experiences count as the same part of the map."""
 
-_SHARP = 2
-"""Links from a loop closure within which its last frame has to match best."""
-
 _AHEAD = 3
 """Links that the robot may pass in a frame."""
 
@@ -27,9 +25,8 @@ _SUDDEN = 0.75
 """Change between two frames, as a share of the mean match error, that may be a kidnapping."""
 
 _REACH = {True: (1.0, 0.0), False: (2.0, 12.0)}
-"""Jump on the map that can be an error of odometry and tracking, after a sudden change and without
-one: a share of the way since the robot was localised last, and a number of links."""
-
+"""Largest jump on the map that odometry and tracking explain, after a sudden change of view and
+without one: a share of the way since the robot was localised last, and a number of links."""
 
 _SETTLE = 20
 """Frames that evidence needs to show a kidnapping, beside those in doubt."""
@@ -143,6 +140,18 @@ class SequenceLocaliser(Mergeable):
             "evidence.cost": costs, "evidence.fresh": costs.clone(), "evidence.made": made
         }  # fmt: skip
 
+    @classmethod
+    def faults(cls, state: Mapping[str, np.ndarray], n_experiences: int) -> Iterator[str]:
+        """Yield what is invalid in a state, for a map of so many experiences."""
+        rows = len(state["evidence.made"])
+        if rows > n_experiences:
+            yield f"localiser.evidence: {rows} rows for {n_experiences} experiences"
+        if int(state["state.mode"]) not in set(Mode):
+            yield f"localiser.state.mode: is {state['state.mode']}, expected 0 to {max(Mode)}"
+        for name in ("candidate", "began", "twin", "jumped"):
+            if not NO_EXPERIENCE <= int(state[f"state.{name}"]) < n_experiences:
+                yield f"localiser.state.{name}: no experience {state[f'state.{name}']}"
+
     def judge(
         self,
         errors: np.ndarray,
@@ -168,14 +177,16 @@ class SequenceLocaliser(Mergeable):
         if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
             s.mode, s.doubts = Mode.DOUBTS, 0
             self._forget()
-        if not (way_m or alarm) or not map_.n:
-            return Localisation("at" if self.tracks else "explore", current)
+        self.new_view = None
+        if not map_.n:
+            return Localisation("explore", current)
+        if not (way_m or alarm):
+            return Localisation("at" if self.tracks else "wait", current)
         s.frames += 1
         source, target = (map_.links_table.array(name) for name in ("source", "target"))
         doubting = s.mode >= Mode.DOUBTS
         old = self.evidence.array("made") <= s.frames - c.recent_frames
         compared = np.ones(map_.n, dtype=bool) if doubting else old
-        self.new_view = None
         if compared.sum() < c.min_experiences:
             self._forget()
             s.mode = Mode.EXPLORES
@@ -200,13 +211,13 @@ class SequenceLocaliser(Mergeable):
             near = around(current, _APART, _APART + s.doubts)
             return self._doubt(costs, relative, near, around, current)
         if self.tracks:
-            return self._track(costs, relative, compared, around, map_)
+            return self._track(costs, compared, around, map_)
         best = int(costs.argmin())
         rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
         jump = self._jumped(compared, around, current)
         if jump != NO_EXPERIENCE:
             return self._go(self._closing(jump, map_), jump, costs[jump], rival)
-        if self._confirmed(best, costs[best], rival, relative, around):
+        if self._confirmed(best, costs[best], rival, around):
             kind = self._closing(best, map_)
             s.mode = Mode.TRACKS
             return self._go(kind, best, costs[best], rival)
@@ -215,7 +226,6 @@ class SequenceLocaliser(Mergeable):
     def _track(
         self,
         costs: np.ndarray,
-        relative: np.ndarray,
         compared: np.ndarray,
         around: _Around,
         map_: ExperienceMap,
@@ -229,7 +239,7 @@ class SequenceLocaliser(Mergeable):
         s.bad = s.bad + 1 if costs[here] > -c.keep else 0
         if not s.bad and costs[here] <= elsewhere[best]:
             s.way_m = 0.0
-        if self._confirmed(best, elsewhere[best], costs[here], relative, around):
+        if self._confirmed(best, elsewhere[best], costs[here], around):
             return self._go(self._closing(best, map_), best, elsewhere[best], costs[here])
         jump = self._jumped(compared, around, current)
         if jump != NO_EXPERIENCE:
@@ -257,7 +267,7 @@ class SequenceLocaliser(Mergeable):
             return self._resume(current)
         best = int(costs.argmin())
         rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
-        if self._confirmed(best, costs[best], rival, relative, around):
+        if self._confirmed(best, costs[best], rival, around):
             if around(current, _APART, _APART + s.doubts)[best]:
                 return self._resume(current)
             s.mode = Mode.TRACKS
@@ -268,13 +278,8 @@ class SequenceLocaliser(Mergeable):
             return Localisation("kidnapped", current)
         return Localisation("wait", current, -costs[best], -rival)
 
-    def _confirmed(
-        self, best: int, cost: float, rival: float, relative: np.ndarray, around: _Around
-    ) -> bool:
-        """Count frames in a row that agree, along the links, on where the robot is.
-
-        The last of them has to show it by itself too: evidence of a sequence lags behind.
-        """
+    def _confirmed(self, best: int, cost: float, rival: float, around: _Around) -> bool:
+        """Count frames in a row that agree, along the links, on where the robot is."""
         s, c = self.state, self.config
         if not (cost < -c.believe and cost < rival - c.margin):
             s.streak, s.candidate = 0, NO_EXPERIENCE
@@ -284,8 +289,7 @@ class SequenceLocaliser(Mergeable):
         elif best not in (s.candidate, s.began):
             s.passed += 1
         s.streak, s.candidate = s.streak + 1, best
-        enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
-        return enough and bool(around(best, _SHARP, _SHARP)[relative.argmin()])
+        return s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
 
     def _jumped(self, compared: np.ndarray, around: _Around, current: int) -> int:
         """Return where the robot is after a sudden change of view, or that there is no sign of one.
@@ -321,8 +325,8 @@ class SequenceLocaliser(Mergeable):
         The second was made while the robot was not localised on the first.
         """
         s, c = self.state, self.config
-        apart = float(np.hypot(*(map_.pose_table[best, :2] - map_.pose_table[map_.current, :2])))
-        if not (cost < -c.believe and cost < present + c.margin and apart < self._nearby(map_)):
+        alike = cost < -c.believe and cost < present + c.margin
+        if not alike or not _side_by_side(best, map_):
             s.twin_frames, s.twin = 0, NO_EXPERIENCE
             return False
         follows = s.twin != NO_EXPERIENCE and around(s.twin, 1, _AHEAD)[best]
@@ -331,9 +335,6 @@ class SequenceLocaliser(Mergeable):
             return False
         s.twin_frames, s.twin = 0, NO_EXPERIENCE
         return True
-
-    def _nearby(self, map_: ExperienceMap) -> float:
-        return 2 * _APART * _link_length(map_)
 
     def _closing(self, best: int, map_: ExperienceMap) -> Literal["link", "set"]:
         """Return whether the robot can have driven to an experience since it was localised last."""
@@ -364,6 +365,12 @@ class SequenceLocaliser(Mergeable):
         s = self.state
         self.evidence.array("cost")[:] = 0.0
         s.streak, s.candidate, s.bad = 0, NO_EXPERIENCE, 0
+
+
+def _side_by_side(experience: int, map_: ExperienceMap) -> bool:
+    """Return whether an experience is a few links, as a crow flies, from the current one."""
+    apart = map_.pose_table[experience, :2] - map_.pose_table[map_.current, :2]
+    return bool(np.hypot(*apart) < 2 * _APART * _link_length(map_))
 
 
 def _link_length(map_: ExperienceMap) -> float:

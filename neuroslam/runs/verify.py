@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, read_checkpoint
+from neuroslam.brain.localiser import SequenceLocaliser
 from neuroslam.config import BrainConfig
 from neuroslam.errors import NeuroslamError, counted, first_line, listed
 from neuroslam.evaluation.trajectory import read_tum
@@ -151,6 +152,10 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         own = f"{population.name}."
         part = {key.removeprefix(own): v for key, v in s.items() if key.startswith(own)}
         yield from population.faults(part, config, n_views, n)
+    if config.map.closure == "sequence":
+        own = "localiser."
+        part = {key.removeprefix(own): v for key, v in s.items() if key.startswith(own)}
+        yield from SequenceLocaliser.faults(part, n) if part else ()
     yield from _origin_faults(s, n)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from neuroslam.mapping.actions import nearest_bound, nearest_bound_of_arrays
 from neuroslam.mapping.relax import Relaxation
+from neuroslam.mapping.sequence import advance_costs, within_links
 from tests.compiled_cases import case, with_and_without
 
 
@@ -33,3 +34,18 @@ def _experiences_with_one_view(draw):
     views, now = draw.integers(0, 3, n), tuple(np.round(draw.uniform(-9.0, 9.0, 3) * 2) / 2)
     found = [find(bound, views, 1, now, torus) for find in (nearest_bound_of_arrays, nearest_bound)]
     return [(np.array(a), np.array(b)) for a, b in zip(*found, strict=True)]
+
+
+@case("mapping.sequence.advance_costs_step", "mapping.sequence.within_links_step")
+def _sequence(rng):
+    n = int(rng.integers(1, 40))
+    source, target = rng.integers(0, n, (2, int(rng.integers(0, 3 * n))))
+    costs, relative = rng.normal(0, 2, (2, n))
+    memory, start = float(rng.uniform(0, 0.99)), int(rng.integers(n))
+    back, ahead = rng.integers(0, 6, 2).tolist()
+    return with_and_without(
+        lambda: [
+            advance_costs(costs, relative, source, target, memory),
+            within_links(start, back, ahead, source, target, n),
+        ]
+    )
