@@ -119,8 +119,9 @@ def _estimated(
         return settings, None
     automatic = resolve_config("auto", config, given)
     estimates = estimate(opened, automatic, stop)
-    for note in estimates.notes:
-        say(note)
+    if estimates.values or preset is not None:
+        for note in estimates.notes:
+            say(note)
     return resolve_config("auto", config, given, estimated=estimates.values), "auto"
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.config.sections import Region, ViewConfig
-from neuroslam.errors import BadFrame
+from neuroslam.errors import BadFrame, counted
 from neuroslam.odometry.visual import column_sums, match_profiles
 from neuroslam.sensors import Source
 from neuroslam.sensors.grey import to_grey
@@ -92,7 +92,11 @@ def estimate(source: Source, config: BrainConfig, stop: int | None = None) -> Es
     first = [] if reduced is None else list(islice(reduced.frames, FIRST))
     if reduced is None or len(first) < _FEWEST:
         return Estimates(
-            {}, [f"auto: {len(first)} frames with a picture, expected {_FEWEST}: not estimated"]
+            {},
+            [
+                f"auto: {counted(len(first), 'frame')} with a picture, expected {_FEWEST}: "
+                "nothing is estimated"
+            ],
         )
     pictures = _moving(first)
     if len(pictures) < _FEWEST // 2:
