@@ -9,7 +9,6 @@ import torch
 
 from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame, SourceError, first_line
-from neuroslam.geometry import TWO_PI
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
     check_image,
@@ -199,22 +198,21 @@ class NavigationBrain(BrainState):
         if view is not None and self.localiser is None:
             match = self.view.match_or_learn(view)
         elif view is not None:
-            way_m = (abs(velocity.v_m_s) + abs(velocity.w_rad_s) / TWO_PI) * dt_s
-            match, localised = self._localise(view, way_m, alarm)
+            match, localised = self._localise(view, Motion(*velocity, dt_s), alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         motion = Motion(*velocity, dt_s)
         return StepInput(frame.index, motion, match, frame.heading_rad, localised=localised)
 
     def _localise(
-        self, view: np.ndarray, way_m: float, alarm: bool
+        self, view: np.ndarray, motion: Motion, alarm: bool
     ) -> tuple[ViewMatch, Localisation]:
         """Localise the robot by the sequence of views; store a view of a place that is unknown."""
         assert self.localiser is not None
         templates = self.map.experiences.array("template")
         errors, headings = self.view.compare(view)
         of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
-        found = self.localiser.judge(of_experience, self.map, way_m, self.continuity.change, alarm)
+        found = self.localiser.judge(of_experience, self.map, motion, self.continuity.change, alarm)
         if found.kind == "kidnapped":
             self.start_new_map("kidnapped")
             return self.view.match_or_learn(view), Localisation("explore", self.map.current)

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from neuroslam.config.sequence import SequenceConfig
+from neuroslam.geometry import TWO_PI, rotate, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, within_links
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import NO_EXPERIENCE, Localisation
+from neuroslam.types import NO_EXPERIENCE, Localisation, Motion, Pose, Revoked
 
 _APART = 6
 """Links within which two experiences count as the same part of the map."""
@@ -27,6 +28,9 @@ _SUDDEN = 0.75
 _REACH = {True: (1.0, 0.0), False: (2.0, 12.0)}
 """Largest jump on the map that odometry and tracking explain, after a sudden change of view and
 without one: a share of the way since the robot was localised last, and a number of links."""
+
+_PROOF = 100
+"""Frames of good evidence after which a loop closure counts as proved."""
 
 _SETTLE = 20
 """Frames that evidence needs to show a kidnapping, beside those in doubt."""
@@ -71,6 +75,13 @@ class _State(Scalars):
         since_sudden: Frames since the view changed much between two frames.
         twin: Experience of another path that may show the same place.
         twin_frames: Frames in a row that agree on it.
+        alike: Match error with the candidates, as a share of the usual one, summed over the streak.
+        origin: Experience at which a loop closure that is not proved yet begins, or none.
+        joined: Experience at which it ends.
+        proved: Frames of good evidence for it.
+        dx_m: Displacement of the robot by odometry from ``origin``, in its frame.
+        dy_m: And to the left.
+        turn_rad: And its turn.
         jumped: Experience that the robot may have been moved to.
         jump_frames: Frames in a row that agree on it.
     """
@@ -88,6 +99,13 @@ class _State(Scalars):
     since_sudden: int
     twin: int
     twin_frames: int
+    alike: float
+    origin: int
+    joined: int
+    proved: int
+    dx_m: float
+    dy_m: float
+    turn_rad: float
     jumped: int
     jump_frames: int
 
@@ -110,17 +128,20 @@ class SequenceLocaliser(Mergeable):
         super().__init__()
         self.config = config
         self.memory = 1.0 - 1.0 / config.memory_frames
+        self.closeness = np.empty(0)  # match errors of this frame, as a share of their mean
         self.new_view: float | None = None  # match error of a new view in this frame, where known
         # Of every experience: accumulated cost, and number of the frame that made it.
         # The fresh cost counts from the last sudden change of view on.
         self.evidence = GrowingTable(
-            {"cost": ((), torch.float64), "fresh": ((), torch.float64), "made": ((), torch.int64)}
+            {name: ((), torch.float64) for name in ("cost", "fresh")} | {"made": ((), torch.int64)}
         )
         self.state = _State(
             mode=Mode.EXPLORES, frames=0, doubts=0, streak=0,
             candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0, bad=0,
             way_m=0.0, localised=0, since_sudden=0,
             twin=NO_EXPERIENCE, twin_frames=0,
+            alike=0.0, origin=NO_EXPERIENCE, joined=NO_EXPERIENCE, proved=0,
+            dx_m=0.0, dy_m=0.0, turn_rad=0.0,
             jumped=NO_EXPERIENCE, jump_frames=0,
         )  # fmt: skip
 
@@ -136,9 +157,8 @@ class SequenceLocaliser(Mergeable):
         made = partial["evidence.made"].new_full((n,), -self.config.recent_frames)
         fresh = SequenceLocaliser(self.config).state_dict()
         merged: State = {name: v for name, v in fresh.items() if name.startswith("state.")}
-        return merged | {
-            "evidence.cost": costs, "evidence.fresh": costs.clone(), "evidence.made": made
-        }  # fmt: skip
+        blank = {f"evidence.{name}": costs.clone() for name in ("cost", "fresh")}
+        return merged | blank | {"evidence.made": made}
 
     @classmethod
     def faults(cls, state: Mapping[str, np.ndarray], n_experiences: int) -> Iterator[str]:
@@ -148,7 +168,7 @@ class SequenceLocaliser(Mergeable):
             yield f"localiser.evidence: {rows} rows for {n_experiences} experiences"
         if int(state["state.mode"]) not in set(Mode):
             yield f"localiser.state.mode: is {state['state.mode']}, expected 0 to {max(Mode)}"
-        for name in ("candidate", "began", "twin", "jumped"):
+        for name in ("candidate", "began", "twin", "jumped", "origin", "joined"):
             if not NO_EXPERIENCE <= int(state[f"state.{name}"]) < n_experiences:
                 yield f"localiser.state.{name}: no experience {state[f'state.{name}']}"
 
@@ -156,7 +176,7 @@ class SequenceLocaliser(Mergeable):
         self,
         errors: np.ndarray,
         map_: ExperienceMap,
-        way_m: float,
+        motion: Motion,
         change: float = 0.0,
         alarm: bool = False,
     ) -> Localisation:
@@ -165,15 +185,20 @@ class SequenceLocaliser(Mergeable):
         Args:
             errors: Match error with the view of every experience, ``(n,)``.
             map_: The robot's own map.
-            way_m: Path length since the last frame, or 1 turn for a metre: a robot at rest adds no
-                evidence.
+            motion: Since the last frame. A robot at rest adds no evidence; for the length of its
+                path a full turn counts as a metre.
             change: Difference of the view from that of the last frame.
             alarm: Whether the view changed too abruptly for driving.
         """
         s, c, current = self.state, self.config, map_.current
         while self.evidence.n < map_.n:
             self.evidence.append(cost=0.0, fresh=0.0, made=s.frames)
+        way_m = (abs(motion.v_m_s) + abs(motion.w_rad_s) / TWO_PI) * motion.dt_s
         s.way_m += way_m
+        if s.origin != NO_EXPERIENCE:
+            s.turn_rad = wrap_angle(s.turn_rad + motion.w_rad_s * motion.dt_s)
+            dx, dy = rotate(motion.v_m_s * motion.dt_s, 0.0, s.turn_rad)
+            s.dx_m, s.dy_m = s.dx_m + dx, s.dy_m + dy
         if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
             s.mode, s.doubts = Mode.DOUBTS, 0
             self._forget()
@@ -203,6 +228,7 @@ class SequenceLocaliser(Mergeable):
         costs = advance_costs(self.evidence.array("cost"), relative, source, target, self.memory)
         self.evidence.array("cost")[:] = costs
         costs = np.where(compared, costs, UNKNOWN)
+        self.closeness = errors / usual
 
         def around(experience: int, back: int, ahead: int) -> np.ndarray:
             return within_links(experience, back, ahead, source, target, map_.n)
@@ -220,6 +246,10 @@ class SequenceLocaliser(Mergeable):
         if self._confirmed(best, costs[best], rival, around):
             kind = self._closing(best, map_)
             s.mode = Mode.TRACKS
+            if kind == "link":
+                offset = map_.offset
+                s.origin, s.joined, s.proved = current, best, 0
+                s.dx_m, s.dy_m, s.turn_rad = offset
             return self._go(kind, best, costs[best], rival)
         return Localisation("explore", current, -costs[best], -rival)
 
@@ -238,17 +268,20 @@ class SequenceLocaliser(Mergeable):
         best = int(elsewhere.argmin())
         s.bad = s.bad + 1 if costs[here] > -c.keep else 0
         if not s.bad and costs[here] <= elsewhere[best]:
-            s.way_m = 0.0
+            s.way_m, s.proved = 0.0, s.proved + 1
+            if s.proved >= _PROOF:
+                s.origin = NO_EXPERIENCE
         if self._confirmed(best, elsewhere[best], costs[here], around):
-            return self._go(self._closing(best, map_), best, elsewhere[best], costs[here])
+            return self._correct(best, elsewhere[best], costs[here], map_)
         jump = self._jumped(compared, around, current)
         if jump != NO_EXPERIENCE:
-            return self._go(self._closing(jump, map_), jump, elsewhere[best], costs[here])
+            return self._correct(jump, elsewhere[best], costs[here], map_)
         if self._is_same_place(best, elsewhere[best], costs[here], around, map_):
             return self._go("link", best, elsewhere[best], costs[here])
         if s.bad >= c.lost_frames:
             s.mode, s.bad = Mode.EXPLORES, 0
-            return Localisation("leave", current, -costs[here], -elsewhere[best])
+            left = Localisation("leave", current, -costs[here], -elsewhere[best])
+            return left._replace(revoked=self._revoke())
         return Localisation("at", current if s.bad else here, -costs[here], -elsewhere[best])
 
     def _doubt(
@@ -285,11 +318,13 @@ class SequenceLocaliser(Mergeable):
             s.streak, s.candidate = 0, NO_EXPERIENCE
             return False
         if s.candidate == NO_EXPERIENCE or not around(s.candidate, 1, _AHEAD)[best]:
-            s.streak, s.passed, s.began = 0, 0, best
+            s.streak, s.passed, s.began, s.alike = 0, 0, best, 0.0
         elif best not in (s.candidate, s.began):
             s.passed += 1
         s.streak, s.candidate = s.streak + 1, best
-        return s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+        s.alike += float(self.closeness[best])
+        enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
+        return enough and s.alike <= c.alike * s.streak
 
     def _jumped(self, compared: np.ndarray, around: _Around, current: int) -> int:
         """Return where the robot is after a sudden change of view, or that there is no sign of one.
@@ -316,6 +351,22 @@ class SequenceLocaliser(Mergeable):
         s.mode = Mode.TRACKS
         self.evidence.array("cost")[:] = self.evidence.array("fresh")
         return best
+
+    def _correct(self, best: int, cost: float, rival: float, map_: ExperienceMap) -> Localisation:
+        """Go to another part of the map; a loop closure that led astray is revoked."""
+        revoked = self._revoke()
+        if revoked is None:
+            return self._go(self._closing(best, map_), best, cost, rival)
+        return self._go("link", best, cost, rival)._replace(revoked=revoked)
+
+    def _revoke(self) -> Revoked | None:
+        """Return the loop closure that is not proved, to be undone."""
+        s = self.state
+        if s.origin == NO_EXPERIENCE:
+            return None
+        revoked = Revoked(s.origin, s.joined, Pose(s.dx_m, s.dy_m, s.turn_rad))
+        s.origin = s.joined = NO_EXPERIENCE
+        return revoked
 
     def _is_same_place(
         self, best: int, cost: float, present: float, around: _Around, map_: ExperienceMap

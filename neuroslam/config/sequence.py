@@ -54,6 +54,13 @@ class SequenceConfig(Section):
         le=1000,
         description="experiences that the robot must pass meanwhile; larger: safer, later",
     )
+    alike: float = Field(
+        default=0.72,
+        gt=0,
+        le=1,
+        description="match error of a believed loop closure, as a share of the mean error with all "
+        "experiences, averaged over the frames that agree; smaller: fewer wrong loop closures",
+    )
     keep: float = Field(
         default=1.5,
         gt=0,

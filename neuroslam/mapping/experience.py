@@ -8,7 +8,7 @@ import torch
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, compose, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.graph import ExperienceGraph
 from neuroslam.mapping.least_squares import solve_pose_graph
@@ -23,6 +23,7 @@ from neuroslam.types import (
     Motion,
     Pose,
     PoseEstimate,
+    Revoked,
     ViewMatch,
 )
 
@@ -105,6 +106,8 @@ class ExperienceMap(ExperienceGraph):
         kidnapped: bool,
     ) -> Action:
         """Create the experience of a new view, or go to that where the robot is localised."""
+        if localised.revoked is not None:
+            self._undo(localised.revoked)
         if view.is_new:
             self.create(view.template, cells, frame)
             return "create"
@@ -119,6 +122,18 @@ class ExperienceMap(ExperienceGraph):
             return "link"
         self.link(there, view.relative_heading_rad)
         return "link"
+
+    def _undo(self, revoked: Revoked) -> None:
+        """Drop the link of a loop closure, and put the robot where odometry alone takes it."""
+        source, target = (self.links_table.array(name) for name in ("source", "target"))
+        kept = torch.from_numpy((source != revoked.source) | (target != revoked.target))
+        table = self.links_table
+        table.replace(**{name: table[name][kept] for name in table.columns})
+        self._relaxation = None
+        s = self.state
+        s.current, s.at_rest = revoked.source, 0
+        here = compose(Pose(*self.experiences.array("pose")[s.current].tolist()), revoked.offset)
+        self.set_pose(here)
 
     def visit(
         self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None
