@@ -86,6 +86,41 @@ class ViewMatch(NamedTuple):
     is_new: bool
 
 
+class Revoked(NamedTuple):
+    """A loop closure that later frames contradict.
+
+    Attributes:
+        source: Experience at which its link begins.
+        target: Experience at which it ends.
+        offset: Pose of the robot relative to ``source``, by odometry alone.
+    """
+
+    source: int
+    target: int
+    offset: Pose
+
+
+class Localisation(NamedTuple):
+    """What a sequence of views says of where on its own map the robot is.
+
+    Attributes:
+        kind: ``at`` an experience; ``link``: a loop closure to it; ``set``: found there after a
+            kidnapping; ``explore``: at places that the map does not know; ``leave``: the known
+            places end here; ``wait``: in doubt, nothing is learnt; ``kidnapped``: a new map has to
+            begin.
+        experience: Of ``at``, ``link`` and ``set``; else the one where the robot was last.
+        evidence: Lead of that experience in standard deviations; 0 where it is not known.
+        rival: That of the best experience in any other part of the map.
+        revoked: Loop closure to undo before.
+    """
+
+    kind: Literal["at", "link", "set", "explore", "leave", "wait", "kidnapped"]
+    experience: int
+    evidence: float = 0.0
+    rival: float = 0.0
+    revoked: Revoked | None = None
+
+
 class PoseEstimate(NamedTuple):
     """Centre of the dominant activity packet in cells; each coordinate in [0, size of its axis)."""
 

@@ -21,8 +21,10 @@ from neuroslam.state.population import Correction, Decision, Population, StepInp
 from neuroslam.state.sessions import Session, session_id
 from neuroslam.threads import is_plain, limit_threads, usable_threads, without_autocast
 from neuroslam.types import (
+    NO_EXPERIENCE,
     NO_TEMPLATE,
     Frame,
+    Localisation,
     Motion,
     PoseEstimate,
     StepResult,
@@ -185,17 +187,49 @@ class NavigationBrain(BrainState):
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)
         gap = accepted.gap
-        kidnapped = view is not None and self.continuity.breaks(view) and self._detects
-        if gap or kidnapped:
-            self.start_new_map("gap" if gap else "kidnapped")
+        alarm = view is not None and self.continuity.breaks(view) and self._detects
+        if gap or alarm:
+            if gap or self.localiser is None:
+                self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
-        match = BLIND if view is None else self.view.match_or_learn(view)
+        match, localised = BLIND, None
+        if view is not None and self.localiser is None:
+            match = self.view.match_or_learn(view)
+        elif view is not None:
+            match, localised = self._localise(view, Motion(*velocity, dt_s), alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
-        return StepInput(frame.index, Motion(*velocity, dt_s), match, frame.heading_rad)
+        motion = Motion(*velocity, dt_s)
+        return StepInput(frame.index, motion, match, frame.heading_rad, localised=localised)
+
+    def _localise(
+        self, view: np.ndarray, motion: Motion, alarm: bool
+    ) -> tuple[ViewMatch, Localisation]:
+        """Localise the robot by the sequence of views; store a view of a place that is unknown."""
+        assert self.localiser is not None
+        templates = self.map.experiences.array("template")
+        errors, headings = self.view.compare(view)
+        of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
+        found = self.localiser.judge(of_experience, self.map, motion, self.continuity.change, alarm)
+        if found.kind == "kidnapped":
+            self.start_new_map("kidnapped")
+            return self.view.match_or_learn(view), Localisation("explore", self.map.current)
+        if found.kind == "set":
+            self._continue_session(self.sessions.now, "kidnapped")
+        here = found.experience
+        error = -1.0 if here == NO_EXPERIENCE else float(of_experience[here])
+        limit = self.localiser.new_view or self.config.view.threshold
+        unlike = not 0.0 <= error <= limit
+        if found.kind == "leave" or (found.kind == "explore" and unlike):
+            return ViewMatch(self.view.learn(view), error, 0.0, True), found
+        if found.kind == "wait":
+            return ViewMatch(NO_TEMPLATE, error, 0.0, False), found
+        template = int(templates[here])
+        heading = float(headings[template]) if template != NO_TEMPLATE else 0.0
+        return ViewMatch(template, error, heading, False), found
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""

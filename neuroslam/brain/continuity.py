@@ -53,6 +53,7 @@ class Continuity(AboutNow):
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
         self.geometry = Geometry.of(config.view)
         self.state = Change(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
+        self.change = 0.0  # between the last two views
         n_pixels = config.view.template_width * config.view.template_height
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 
@@ -68,7 +69,7 @@ class Continuity(AboutNow):
         if s.frames == 1:
             return False
         apart = distances(before.numpy(force=True)[None], query, self.geometry).min()
-        change = float(apart) / (255.0 * self.geometry.n_pixels)
+        self.change = change = float(apart) / (255.0 * self.geometry.n_pixels)
         broken = (
             s.frames > _SETTLED
             and change > max(self.threshold, self.factor * s.usual)

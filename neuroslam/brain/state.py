@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
+from neuroslam.brain.localiser import SequenceLocaliser
 from neuroslam.brain.recognition import Recognition, StoredViews
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import HOMES
@@ -165,6 +166,9 @@ class BrainState(QuickModule):
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
+        self.localiser: SequenceLocaliser | None = None
+        if config.map.closure == "sequence" and leader.relaxes_map and leader.needs_views:
+            self.localiser = SequenceLocaliser(config.sequence)
         self._changed()
         if set(self._populations) - HOMES.keys():  # those of the package have names of their own
             check_names(self._populations.values())
@@ -290,7 +294,7 @@ class BrainState(QuickModule):
         """
         if not self.map.n:
             return
-        before, clock, tally = self.sessions.now, self.clock, self.recognition.tally
+        before, tally = self.sessions.now, self.recognition.tally
         senses = self.odometry, self.continuity  # kept: they compare successive frames
         kept = type(self)(self.config)
         kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
@@ -303,17 +307,22 @@ class BrainState(QuickModule):
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)
         self.recognition.store()
+        self._continue_session(before, why)
+
+    def _continue_session(self, before: Session, why: str) -> None:
+        """Open a session of the same recording: odometry does not connect it with the last one."""
         session = Session(
-            session_id(before.id, clock.frames_seen, why),
+            session_id(before.id, self.clock.frames_seen, why),
             before.source,
             before.preset,
             before.recorded,
-            clock.frame + 1,
-            clock.time_s,
+            self.clock.frame + 1,
+            self.clock.time_s,
             began=why,
             continues=before.id,
         )
         self._open(session)
+        self.map.state.made = 0
 
     def restore(self, state: State, stored: Sequence[Self]) -> None:
         """Replace the state and the stored maps."""

@@ -369,6 +369,23 @@ class PoseCellNetwork(Population):
             self.packet = inject(packet, at, energy)
         self._now.injected = True
 
+    def relocalise(self, view: ViewMatch) -> None:
+        """Move the activity to where a known view is bound: a sequence of views leaves no doubt."""
+        if not 0 <= view.template < self.bindings.n:
+            return
+        n_theta, n_y, n_x = self.shape
+        turned = view.relative_heading_rad * n_theta / TWO_PI
+        bound = [self.bindings[name][view.template].item() for name in ("x", "y", "theta")]
+        here = cast(PoseEstimate, self.estimate)
+        moved = [
+            (to + by - at + n / 2) % n - n / 2
+            for to, by, at, n in zip(
+                bound, (0.0, 0.0, turned), here, (n_x, n_y, n_theta), strict=True
+            )
+        ]
+        self.nudge(*moved)
+        self._now.injected = True  # the next step measures no slip across the jump
+
     def forward(self, motion: Motion, view: ViewMatch) -> PoseEstimate:
         """Advance one frame: inject by the view, settle the attractor, move it by odometry."""
         self.update_from_view(view)
@@ -397,8 +414,16 @@ class PoseCellNetwork(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose-cell estimate."""
+        localised = now.localised
+        if localised is not None and localised.kind in ("link", "set"):
+            self.relocalise(now.view)
         cells = cast(PoseEstimate, self.estimate)
-        return Decision(*map_(now.motion, now.view, cells, now.frame, kidnapped=now.vetoed))
+        return Decision(
+            *map_(
+                now.motion, now.view, cells, now.frame,
+                kidnapped=now.vetoed, localised=localised,
+            )
+        )  # fmt: skip
 
     @property
     def rates(self) -> np.ndarray:

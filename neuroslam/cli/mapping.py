@@ -32,6 +32,7 @@ from neuroslam.cli.tables import Table
 from neuroslam.errors import counted
 
 if TYPE_CHECKING:
+    from neuroslam.config import BrainConfig
     from neuroslam.runs.results import RunSummary
 
 
@@ -70,7 +71,10 @@ def run_command(
     if confirm is not None:
         assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
     base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
-    settings = resolve_config(preset, config, tuple(assignments or ()), base)
+    given = tuple(assignments or ())
+    settings = resolve_config(preset, config, given, base)
+    if preset == "auto" or (preset is None and config is None and not maps):
+        settings, preset = _estimated(source, config, given, stop, settings, preset)
     with show_frames(source) as (on_start, on_step):
         summary = run(
             source,
@@ -92,6 +96,33 @@ def run_command(
             save_every_s=save_every,
         )
     return _report(summary, out, "run")
+
+
+def _estimated(
+    source: str,
+    config: Path | None,
+    given: tuple[str, ...],
+    stop: int | None,
+    settings: "BrainConfig",
+    preset: str | None,
+) -> tuple["BrainConfig", str | None]:
+    """Return the preset ``auto`` with what is estimated from the first laps of the source.
+
+    Without a preset, a source that has no pictures keeps the settings that it has.
+    """
+    from neuroslam.runs.run import resolve_config
+    from neuroslam.sensors import open_source
+    from neuroslam.tuning.auto import estimate, has_pictures
+
+    opened = open_source(source, settings.frame_rate_hz, settings.view.grey)
+    if preset is None and not has_pictures(opened):
+        return settings, None
+    automatic = resolve_config("auto", config, given)
+    estimates = estimate(opened, automatic, stop)
+    if estimates.values or preset is not None:
+        for note in estimates.notes:
+            say(note)
+    return resolve_config("auto", config, given, estimated=estimates.values), "auto"
 
 
 def resume_command(

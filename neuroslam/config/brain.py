@@ -20,6 +20,7 @@ from neuroslam.config.sections import (
     ViewConfig,
 )
 from neuroslam.config.semantic import SemanticConfig
+from neuroslam.config.sequence import SequenceConfig
 
 
 class BrainConfig(Section):
@@ -39,6 +40,7 @@ class BrainConfig(Section):
     view: ViewConfig = ViewConfig()
     pose_cells: PoseCellConfig = PoseCellConfig()
     map: MapConfig = MapConfig()
+    sequence: SequenceConfig = SequenceConfig()
     sessions: SessionConfig = SessionConfig()
     boundary_cells: BoundaryCellConfig = BoundaryCellConfig()
     grid_cells: GridCellConfig = GridCellConfig()

@@ -402,6 +402,11 @@ class MapConfig(Section):
         description="largest correction (m, rad) at which the map counts as converged; larger: "
         "relaxation stops earlier",
     )
+    closure: Literal["view", "sequence"] = Field(
+        default="view",
+        description="what closes a loop; view: a single view and the pose cells, as in RatSLAM; "
+        "sequence: views of several frames along the links of the map, see [sequence]",
+    )
     sigma_m: float = Field(
         default=0.1,
         gt=0,

@@ -8,7 +8,7 @@ import torch
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, compose, rotate, wrap_angle, wrap_angles
 from neuroslam.mapping.actions import choose_action
 from neuroslam.mapping.graph import ExperienceGraph
 from neuroslam.mapping.incremental import IncrementalSolver
@@ -17,7 +17,16 @@ from neuroslam.mapping.planning import Plan
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.state.population import Action, Correction
-from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Motion, Pose, PoseEstimate, ViewMatch
+from neuroslam.types import (
+    NO_EXPERIENCE,
+    NO_TEMPLATE,
+    Localisation,
+    Motion,
+    Pose,
+    PoseEstimate,
+    Revoked,
+    ViewMatch,
+)
 
 
 class ExperienceMap(ExperienceGraph):
@@ -51,6 +60,7 @@ class ExperienceMap(ExperienceGraph):
         frame: int,
         *,
         kidnapped: bool = False,
+        localised: Localisation | None = None,
     ) -> tuple[Action, int]:
         """Advance by one frame; return the action and the experience that the robot is at.
 
@@ -60,10 +70,14 @@ class ExperienceMap(ExperienceGraph):
             cells: Pose-cell estimate.
             frame: Number of the frame.
             kidnapped: The robot did not drive to where the view was learnt: no link is made.
+            localised: Where a sequence of views localises the robot; ``None``: the view and the
+                pose cells decide.
         """
         self.move(motion)
         action: Action = "none"
-        if view.template != NO_TEMPLATE:
+        if localised is not None:
+            action = self._follow_sequence(view, cells, frame, localised, kidnapped)
+        elif view.template != NO_TEMPLATE:
             turned = view.relative_heading_rad * self.torus[2] / TWO_PI
             action, found = choose_action(
                 cells,
@@ -86,6 +100,44 @@ class ExperienceMap(ExperienceGraph):
         self.relax()
         self._drop_finished_goals()
         return action, self.state.current
+
+    def _follow_sequence(
+        self,
+        view: ViewMatch,
+        cells: PoseEstimate,
+        frame: int,
+        localised: Localisation,
+        kidnapped: bool,
+    ) -> Action:
+        """Create the experience of a new view, or go to that where the robot is localised."""
+        if localised.revoked is not None:
+            self._undo(localised.revoked)
+        if view.is_new:
+            self.create(view.template, cells, frame)
+            return "create"
+        there = localised.experience
+        if localised.kind not in ("at", "link", "set") or there in (NO_EXPERIENCE, self.current):
+            return "none"
+        if localised.kind == "set" or kidnapped:
+            self.relocalise(there, view.relative_heading_rad)
+            return "set"
+        if localised.kind == "at" and not self._linked(self.current, there):
+            self.relocalise(there, view.relative_heading_rad)  # it has passed more than one link
+            return "link"
+        self.link(there, view.relative_heading_rad)
+        return "link"
+
+    def _undo(self, revoked: Revoked) -> None:
+        """Drop the link of a loop closure, and put the robot where odometry alone takes it."""
+        source, target = (self.links_table.array(name) for name in ("source", "target"))
+        kept = torch.from_numpy((source != revoked.source) | (target != revoked.target))
+        table = self.links_table
+        table.replace(**{name: table[name][kept] for name in table.columns})
+        self._relaxation = None
+        s = self.state
+        s.current, s.at_rest = revoked.source, 0
+        here = compose(Pose(*self.experiences.array("pose")[s.current].tolist()), revoked.offset)
+        self.set_pose(here)
 
     def visit(
         self, place: int, pose: Pose, elapsed_s: float, frame: int, at: Pose | None = None

@@ -1,11 +1,12 @@
 """A run: a brain maps a source, and the files of the run are written meanwhile."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -54,6 +55,7 @@ def resolve_config(
     base: BrainConfig | None = None,
     *,
     option: str = "--set",
+    estimated: Mapping[str, Any] | None = None,
 ) -> BrainConfig:
     """Build a config from a preset, a config file and assignments; the later ones override.
 
@@ -64,6 +66,7 @@ def resolve_config(
         base: Config to start from if there is neither preset nor file, e.g. that of a stored map;
             default: the default config.
         option: Command-line option of the assignments, for messages.
+        estimated: Sections and keys estimated from the source; they override the preset alone.
 
     Raises:
         ConfigError: If a preset, file, key or value is invalid.
@@ -76,6 +79,8 @@ def resolve_config(
     origin = f"preset {preset}" if preset else "config"
     if base is not None and not preset and config is None:
         values = base.model_dump(exclude_none=True)
+    if estimated:
+        values = merge_values(values, dict(estimated))
     if config is not None:
         from_file = read_config_file(config)
         from_file.pop("run", None)  # table of the config.toml of a run

@@ -189,6 +189,26 @@ class LocalViewCells(Mergeable):
         errors = sums[best, np.arange(len(best))] / (255.0 * self.geometry.n_pixels)
         return errors, turns[best]
 
+    def compare(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return match error and relative heading of a view with every template.
+
+        Args:
+            view: Result of :meth:`encode`.
+
+        Returns:
+            Mean absolute differences in [0, 1] at the best shift, of views rounded to bytes, and
+            headings in radians, 0 for forward views; each ``(n,)``.
+        """
+        self._check(view)
+        if not self.n:
+            return np.empty(0), np.empty(0)
+        sums = distances(self.templates.array("pixels"), to_bytes(view.T), self.geometry)
+        errors = sums.min(axis=0) / (255.0 * self.geometry.n_pixels)
+        if not self.config.panoramic:
+            return errors, np.zeros(self.n)
+        of_shift = np.array([self._relative_heading(offset) for offset in self.geometry.offsets])
+        return errors, of_shift[sums.argmin(axis=0)]
+
     def search(self, view: np.ndarray, limit: float = np.inf) -> ViewMatch:
         """Find the nearest template, without learning; the lowest id of equally near ones.
 

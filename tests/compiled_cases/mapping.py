@@ -13,6 +13,7 @@ from neuroslam.mapping.pose_graph import (
     robust_cost,
 )
 from neuroslam.mapping.relax import Relaxation
+from neuroslam.mapping.sequence import advance_costs, within_links
 from tests.compiled_cases import case, with_and_without
 
 
@@ -104,3 +105,18 @@ def _what_moves_in_a_graph(draw):
 
     steps = links_of, robust_cost, poses_that_follow, mismatch_over_path
     return list(zip(found(*(s.plain for s in steps)), found(*steps), strict=True))
+
+
+@case("mapping.sequence.advance_costs_step", "mapping.sequence.within_links_step")
+def _sequence(rng):
+    n = int(rng.integers(1, 40))
+    source, target = rng.integers(0, n, (2, int(rng.integers(0, 3 * n))))
+    costs, relative = rng.normal(0, 2, (2, n))
+    memory, start = float(rng.uniform(0, 0.99)), int(rng.integers(n))
+    back, ahead = rng.integers(0, 6, 2).tolist()
+    return with_and_without(
+        lambda: [
+            advance_costs(costs, relative, source, target, memory),
+            within_links(start, back, ahead, source, target, n),
+        ]
+    )
