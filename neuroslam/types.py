@@ -100,7 +100,7 @@ class Revoked(NamedTuple):
     offset: Pose
 
 
-class Localisation(NamedTuple):
+class Tracking(NamedTuple):
     """What a sequence of views says of where on its own map the robot is.
 
     Attributes:

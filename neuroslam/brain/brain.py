@@ -24,10 +24,10 @@ from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,
     Frame,
-    Localisation,
     Motion,
     PoseEstimate,
     StepResult,
+    Tracking,
     Velocity,
     ViewMatch,
 )
@@ -189,39 +189,37 @@ class NavigationBrain(BrainState):
         gap = accepted.gap
         alarm = view is not None and self.continuity.breaks(view) and self._detects
         if gap or alarm:
-            if gap or self.localiser is None:
+            if gap or self.tracker is None:
                 self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
-        match, localised = BLIND, None
-        if view is not None and self.localiser is None:
+        match, tracking = BLIND, None
+        if view is not None and self.tracker is None:
             match = self.view.match_or_learn(view)
         elif view is not None:
-            match, localised = self._localise(view, Motion(*velocity, dt_s), alarm)
+            match, tracking = self._track(view, Motion(*velocity, dt_s), alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         motion = Motion(*velocity, dt_s)
-        return StepInput(frame.index, motion, match, frame.heading_rad, localised=localised)
+        return StepInput(frame.index, motion, match, frame.heading_rad, tracking=tracking)
 
-    def _localise(
-        self, view: np.ndarray, motion: Motion, alarm: bool
-    ) -> tuple[ViewMatch, Localisation]:
+    def _track(self, view: np.ndarray, motion: Motion, alarm: bool) -> tuple[ViewMatch, Tracking]:
         """Localise the robot by the sequence of views; store a view of a place that is unknown."""
-        assert self.localiser is not None
+        assert self.tracker is not None
         templates = self.map.experiences.array("template")
         errors, headings = self.view.compare(view)
         of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
-        found = self.localiser.judge(of_experience, self.map, motion, self.continuity.change, alarm)
+        found = self.tracker.judge(of_experience, self.map, motion, self.continuity.change, alarm)
         if found.kind == "kidnapped":
             self.start_new_map("kidnapped")
-            return self.view.match_or_learn(view), Localisation("explore", self.map.current)
+            return self.view.match_or_learn(view), Tracking("explore", self.map.current)
         if found.kind == "set":
             self._continue_session(self.sessions.now, "kidnapped")
         here = found.experience
         error = -1.0 if here == NO_EXPERIENCE else float(of_experience[here])
-        limit = self.localiser.new_view or self.config.view.threshold
+        limit = self.tracker.new_view or self.config.view.threshold
         unlike = not 0.0 <= error <= limit
         if found.kind == "leave" or (found.kind == "explore" and unlike):
             return ViewMatch(self.view.learn(view), error, 0.0, True), found

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain.brain import NavigationBrain
-from neuroslam.brain.localiser import SequenceLocaliser
+from neuroslam.brain.tracker import SequenceTracker
 from neuroslam.config import BrainConfig
 from neuroslam.errors import counted, first_line, listed
 from neuroslam.mapping.tables import Links, origin_key
@@ -148,9 +148,9 @@ def _faults(state: State, config: BrainConfig) -> Iterator[str]:
         part = {key.removeprefix(own): v for key, v in s.items() if key.startswith(own)}
         yield from population.faults(part, config, n_views, n)
     if config.map.closure == "sequence":
-        own = "localiser."
+        own = "tracker."
         part = {key.removeprefix(own): v for key, v in s.items() if key.startswith(own)}
-        yield from SequenceLocaliser.faults(part, n) if part else ()
+        yield from SequenceTracker.faults(part, n) if part else ()
     yield from _origin_faults(s, n)
 
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
-from neuroslam.brain.localiser import SequenceLocaliser
 from neuroslam.brain.recognition import Recognition, StoredViews
+from neuroslam.brain.tracker import SequenceTracker
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import HOMES
 from neuroslam.config.size import check_size
@@ -166,9 +166,9 @@ class BrainState(QuickModule):
         self.sessions = SessionLog()
         self.recognition = Recognition()
         self.continuity = Continuity(config)
-        self.localiser: SequenceLocaliser | None = None
+        self.tracker: SequenceTracker | None = None
         if config.map.closure == "sequence" and leader.relaxes_map and leader.needs_views:
-            self.localiser = SequenceLocaliser(config.sequence)
+            self.tracker = SequenceTracker(config.sequence)
         self._changed()
         if set(self._populations) - HOMES.keys():  # those of the package have names of their own
             check_names(self._populations.values())

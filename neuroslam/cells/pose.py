@@ -414,14 +414,14 @@ class PoseCellNetwork(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose-cell estimate."""
-        localised = now.localised
-        if localised is not None and localised.kind in ("link", "set"):
+        tracking = now.tracking
+        if tracking is not None and tracking.kind in ("link", "set"):
             self.relocalise(now.view)
         cells = cast(PoseEstimate, self.estimate)
         return Decision(
             *map_(
                 now.motion, now.view, cells, now.frame,
-                kidnapped=now.vetoed, localised=localised,
+                kidnapped=now.vetoed, tracking=tracking,
             )
         )  # fmt: skip
 

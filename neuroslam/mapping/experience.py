@@ -20,11 +20,11 @@ from neuroslam.state.population import Action, Correction
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,
-    Localisation,
     Motion,
     Pose,
     PoseEstimate,
     Revoked,
+    Tracking,
     ViewMatch,
 )
 
@@ -60,7 +60,7 @@ class ExperienceMap(ExperienceGraph):
         frame: int,
         *,
         kidnapped: bool = False,
-        localised: Localisation | None = None,
+        tracking: Tracking | None = None,
     ) -> tuple[Action, int]:
         """Advance by one frame; return the action and the experience that the robot is at.
 
@@ -70,13 +70,13 @@ class ExperienceMap(ExperienceGraph):
             cells: Pose-cell estimate.
             frame: Number of the frame.
             kidnapped: The robot did not drive to where the view was learnt: no link is made.
-            localised: Where a sequence of views localises the robot; ``None``: the view and the
+            tracking: Where a sequence of views localises the robot; ``None``: the view and the
                 pose cells decide.
         """
         self.move(motion)
         action: Action = "none"
-        if localised is not None:
-            action = self._follow_sequence(view, cells, frame, localised, kidnapped)
+        if tracking is not None:
+            action = self._follow_sequence(view, cells, frame, tracking, kidnapped)
         elif view.template != NO_TEMPLATE:
             turned = view.relative_heading_rad * self.torus[2] / TWO_PI
             action, found = choose_action(
@@ -106,22 +106,22 @@ class ExperienceMap(ExperienceGraph):
         view: ViewMatch,
         cells: PoseEstimate,
         frame: int,
-        localised: Localisation,
+        tracking: Tracking,
         kidnapped: bool,
     ) -> Action:
         """Create the experience of a new view, or go to that where the robot is localised."""
-        if localised.revoked is not None:
-            self._undo(localised.revoked)
+        if tracking.revoked is not None:
+            self._undo(tracking.revoked)
         if view.is_new:
             self.create(view.template, cells, frame)
             return "create"
-        there = localised.experience
-        if localised.kind not in ("at", "link", "set") or there in (NO_EXPERIENCE, self.current):
+        there = tracking.experience
+        if tracking.kind not in ("at", "link", "set") or there in (NO_EXPERIENCE, self.current):
             return "none"
-        if localised.kind == "set" or kidnapped:
+        if tracking.kind == "set" or kidnapped:
             self.relocalise(there, view.relative_heading_rad)
             return "set"
-        if localised.kind == "at" and not self._linked(self.current, there):
+        if tracking.kind == "at" and not self._linked(self.current, there):
             self.relocalise(there, view.relative_heading_rad)  # it has passed more than one link
             return "link"
         self.link(there, view.relative_heading_rad)

@@ -18,7 +18,7 @@ from neuroslam.geometry import rotate
 from neuroslam.state.join import Join, MovedCells
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import Mergeable, Rule, State, merge_by_rules
-from neuroslam.types import Frame, Localisation, Motion, Pose, PoseEstimate, ViewMatch
+from neuroslam.types import Frame, Motion, Pose, PoseEstimate, Tracking, ViewMatch
 
 Action = Literal["none", "create", "link", "set"]
 Observation = Any
@@ -38,7 +38,7 @@ class StepInput(NamedTuple):
         view: View that the frame shows; template -1 where the brain has no views, or shows none.
         compass_rad: Heading by a compass; ``None``: it has none.
         vetoed: A population contradicts that the robot is where the view was learnt.
-        localised: What the sequence of views says; ``None``: each view decides by itself.
+        tracking: What the sequence of views says; ``None``: each view decides by itself.
     """
 
     frame: int
@@ -46,7 +46,7 @@ class StepInput(NamedTuple):
     view: ViewMatch
     compass_rad: float | None = None
     vetoed: bool = False
-    localised: Localisation | None = None
+    tracking: Tracking | None = None
 
 
 class Correction(NamedTuple):
@@ -369,7 +369,7 @@ class LeadableMap(Protocol):
         frame: int,
         *,
         kidnapped: bool,
-        localised: Localisation | None,
+        tracking: Tracking | None,
     ) -> tuple[Action, int]:
         """Integrate odometry, and go to an experience by view."""
         ...

@@ -272,7 +272,7 @@ def _field_of_view(frames: Iterator[Frame], config: BrainConfig) -> tuple[float 
         except BadFrame:
             continue
         turned += result.motion.w_rad_s * result.motion.dt_s
-        if brain.localiser is not None and brain.localiser.tracks:
+        if brain.tracker is not None and brain.tracker.tracks:
             before = last.get(result.experience)
             if before is not None and result.action == "link":
                 laps.append(turned - before[0])

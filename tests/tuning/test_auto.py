@@ -9,7 +9,7 @@ from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
 from neuroslam.tuning.auto import estimate, has_pictures
 from neuroslam.types import Frame
-from tests.brain.test_localiser import laps, strip
+from tests.brain.test_tracker import laps, strip
 
 
 class Wall:

@@ -1,4 +1,4 @@
-"""Localisation on the robot's own map by sequences of views, and after a kidnapping."""
+"""Tracking on the robot's own map by sequences of views, and after a kidnapping."""
 
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
@@ -14,7 +14,7 @@ from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, 
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import NO_EXPERIENCE, Localisation, Motion, Pose, Revoked
+from neuroslam.types import NO_EXPERIENCE, Motion, Pose, Revoked, Tracking
 
 _APART = 6
 """Links within which two experiences count as the same part of the map."""
@@ -37,7 +37,7 @@ _SETTLE = 20
 
 
 class Mode(IntEnum):
-    """What the localiser believes.
+    """What the tracker believes.
 
     Attributes:
         EXPLORES: The robot is at places that the map does not know.
@@ -110,7 +110,7 @@ class _State(Scalars):
     jump_frames: int
 
 
-class SequenceLocaliser(Mergeable):
+class SequenceTracker(Mergeable):
     """Decides from sequences of views where on its own map the robot is.
 
     :mod:`neuroslam.mapping.sequence` has the recursion. A loop closure is believed if its evidence
@@ -155,7 +155,7 @@ class SequenceLocaliser(Mergeable):
         n = join.n_experiences + len(join.kept_experiences)
         costs = partial["evidence.cost"].new_zeros(n)
         made = partial["evidence.made"].new_full((n,), -self.config.recent_frames)
-        fresh = SequenceLocaliser(self.config).state_dict()
+        fresh = SequenceTracker(self.config).state_dict()
         merged: State = {name: v for name, v in fresh.items() if name.startswith("state.")}
         blank = {f"evidence.{name}": costs.clone() for name in ("cost", "fresh")}
         return merged | blank | {"evidence.made": made}
@@ -165,12 +165,12 @@ class SequenceLocaliser(Mergeable):
         """Yield what is invalid in a state, for a map of so many experiences."""
         rows = len(state["evidence.made"])
         if rows > n_experiences:
-            yield f"localiser.evidence: {rows} rows for {n_experiences} experiences"
+            yield f"tracker.evidence: {rows} rows for {n_experiences} experiences"
         if int(state["state.mode"]) not in set(Mode):
-            yield f"localiser.state.mode: is {state['state.mode']}, expected 0 to {max(Mode)}"
+            yield f"tracker.state.mode: is {state['state.mode']}, expected 0 to {max(Mode)}"
         for name in ("candidate", "began", "twin", "jumped", "origin", "joined"):
             if not NO_EXPERIENCE <= int(state[f"state.{name}"]) < n_experiences:
-                yield f"localiser.state.{name}: no experience {state[f'state.{name}']}"
+                yield f"tracker.state.{name}: no experience {state[f'state.{name}']}"
 
     def judge(
         self,
@@ -179,7 +179,7 @@ class SequenceLocaliser(Mergeable):
         motion: Motion,
         change: float = 0.0,
         alarm: bool = False,
-    ) -> Localisation:
+    ) -> Tracking:
         """Take the match errors of a frame into the evidence, and say where the robot is.
 
         Args:
@@ -204,9 +204,9 @@ class SequenceLocaliser(Mergeable):
             self._forget()
         self.new_view = None
         if not map_.n:
-            return Localisation("explore", current)
+            return Tracking("explore", current)
         if not (way_m or alarm):
-            return Localisation("at" if self.tracks else "wait", current)
+            return Tracking("at" if self.tracks else "wait", current)
         s.frames += 1
         source, target = (map_.links_table.array(name) for name in ("source", "target"))
         doubting = s.mode >= Mode.DOUBTS
@@ -215,7 +215,7 @@ class SequenceLocaliser(Mergeable):
         if compared.sum() < c.min_experiences:
             self._forget()
             s.mode = Mode.EXPLORES
-            return Localisation("explore", current)
+            return Tracking("explore", current)
         usual = float(errors[compared].mean())
         self.new_view = c.new_view * usual
         s.since_sudden = 0 if change > _SUDDEN * usual else s.since_sudden + 1
@@ -251,7 +251,7 @@ class SequenceLocaliser(Mergeable):
                 s.origin, s.joined, s.proved = current, best, 0
                 s.dx_m, s.dy_m, s.turn_rad = offset
             return self._go(kind, best, costs[best], rival)
-        return Localisation("explore", current, -costs[best], -rival)
+        return Tracking("explore", current, -costs[best], -rival)
 
     def _track(
         self,
@@ -259,7 +259,7 @@ class SequenceLocaliser(Mergeable):
         compared: np.ndarray,
         around: _Around,
         map_: ExperienceMap,
-    ) -> Localisation:
+    ) -> Tracking:
         """Follow the robot along the links, and notice when it left them."""
         s, c, current = self.state, self.config, map_.current
         near = np.flatnonzero(around(current, 1, _AHEAD + 1 + s.bad))
@@ -280,9 +280,9 @@ class SequenceLocaliser(Mergeable):
             return self._go("link", best, elsewhere[best], costs[here])
         if s.bad >= c.lost_frames:
             s.mode, s.bad = Mode.EXPLORES, 0
-            left = Localisation("leave", current, -costs[here], -elsewhere[best])
+            left = Tracking("leave", current, -costs[here], -elsewhere[best])
             return left._replace(revoked=self._revoke())
-        return Localisation("at", current if s.bad else here, -costs[here], -elsewhere[best])
+        return Tracking("at", current if s.bad else here, -costs[here], -elsewhere[best])
 
     def _doubt(
         self,
@@ -291,7 +291,7 @@ class SequenceLocaliser(Mergeable):
         near: np.ndarray,
         around: _Around,
         current: int,
-    ) -> Localisation:
+    ) -> Tracking:
         """Look for the robot where it was, then on the whole map."""
         s, c = self.state, self.config
         s.doubts += 1
@@ -308,8 +308,8 @@ class SequenceLocaliser(Mergeable):
         if s.doubts > c.doubt_frames:
             s.mode = Mode.SEARCHES
         if s.doubts > c.doubt_frames + c.search_frames:
-            return Localisation("kidnapped", current)
-        return Localisation("wait", current, -costs[best], -rival)
+            return Tracking("kidnapped", current)
+        return Tracking("wait", current, -costs[best], -rival)
 
     def _confirmed(self, best: int, cost: float, rival: float, around: _Around) -> bool:
         """Count frames in a row that agree, along the links, on where the robot is."""
@@ -352,7 +352,7 @@ class SequenceLocaliser(Mergeable):
         self.evidence.array("cost")[:] = self.evidence.array("fresh")
         return best
 
-    def _correct(self, best: int, cost: float, rival: float, map_: ExperienceMap) -> Localisation:
+    def _correct(self, best: int, cost: float, rival: float, map_: ExperienceMap) -> Tracking:
         """Go to another part of the map; a loop closure that led astray is revoked."""
         revoked = self._revoke()
         if revoked is None:
@@ -398,19 +398,19 @@ class SequenceLocaliser(Mergeable):
 
     def _go(
         self, kind: Literal["link", "set"], experience: int, cost: float, rival: float
-    ) -> Localisation:
+    ) -> Tracking:
         s = self.state
         s.bad = s.streak = s.doubts = s.jump_frames = 0
         s.way_m, s.localised = 0.0, 1
         s.candidate = NO_EXPERIENCE
-        return Localisation(kind, experience, -float(cost), -float(rival))
+        return Tracking(kind, experience, -float(cost), -float(rival))
 
-    def _resume(self, current: int) -> Localisation:
+    def _resume(self, current: int) -> Tracking:
         """Go on as before the doubt."""
         s = self.state
         s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
         self._forget()
-        return Localisation("explore", current)
+        return Tracking("explore", current)
 
     def _forget(self) -> None:
         s = self.state

@@ -1,4 +1,4 @@
-"""Localisation by sequences of views: laps close, maps stop growing, bumps are no kidnapping."""
+"""Tracking by sequences of views: laps close, maps stop growing, bumps are no kidnapping."""
 
 import copy
 import csv
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.brain.localiser import Mode
+from neuroslam.brain.tracker import Mode
 from neuroslam.config import BrainConfig
 from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
@@ -70,7 +70,7 @@ def test_a_lap_comes_home_and_the_map_stops_growing(three_laps):
     after_lap = [results[round(lap * LAP) - 1].n_experiences for lap in (1, 2, 3)]
     assert after_lap[1] < 1.35 * after_lap[0]
     assert after_lap[2] == after_lap[1]
-    assert robot.localiser.tracks
+    assert robot.tracker.tracks
     assert not robot.stored
     same = [
         np.hypot(*(np.array(results[i].pose[:2]) - results[i - LAP // 2].pose[:2]))
@@ -103,7 +103,7 @@ def test_the_threshold_hardly_matters(three_laps, factor):
     for frame in drive(laps(3)):
         other(frame)
     assert other.map.n == pytest.approx(three_laps[0].map.n, rel=0.3)
-    assert other.localiser.tracks
+    assert other.tracker.tracks
 
 
 def test_a_wall_that_never_repeats_closes_no_loop():
@@ -111,7 +111,7 @@ def test_a_wall_that_never_repeats_closes_no_loop():
     wall = strip(5, 7200)
     results = [robot(frame) for frame in drive(laps(3) / 3, wall)]
     assert {r.action for r in results} <= {"create", "none"}
-    assert robot.localiser.state.mode == Mode.EXPLORES
+    assert robot.tracker.state.mode == Mode.EXPLORES
 
 
 def test_a_path_in_reverse_order_is_not_believed():
@@ -119,7 +119,7 @@ def test_a_path_in_reverse_order_is_not_believed():
     robot = brain()
     for frame in drive(np.concatenate([laps(1.0), laps(1.0)[::-1]])):
         result = robot(frame)
-    assert not robot.localiser.tracks
+    assert not robot.tracker.tracks
     assert result.action in ("create", "none")
 
 
@@ -150,7 +150,7 @@ def test_bumps_and_blur_are_no_kidnapping(three_laps):
     assert "set" not in actions
     assert not robot.stored
     assert robot.sessions.now.began != "kidnapped"
-    assert robot.localiser.tracks
+    assert robot.tracker.tracks
 
 
 def test_an_unknown_way_is_mapped_and_joined_at_both_ends(three_laps):
@@ -160,7 +160,7 @@ def test_an_unknown_way_is_mapped_and_joined_at_both_ends(three_laps):
     back = drive(laps(0.6, 0.4), first=3 * LAP + 100)
     actions = [robot(frame).action for frame in (*detour, *back)]
     assert robot.map.n > before + 10
-    assert robot.localiser.tracks
+    assert robot.tracker.tracks
     assert not robot.stored
     assert "set" not in actions or actions.index("set") > 100
     links = robot.map.links
@@ -172,11 +172,11 @@ def test_an_unknown_way_is_mapped_and_joined_at_both_ends(three_laps):
 def test_a_robot_at_rest_learns_nothing(three_laps):
     robot = copy.deepcopy(three_laps[0])
     rng = np.random.default_rng(0)
-    before = {name: value.clone() for name, value in robot.localiser.state_dict().items()}
+    before = {name: value.clone() for name, value in robot.tracker.state_dict().items()}
     for i in range(30):
         image = np.repeat(picture(strip(3), i / 30, rng)[:, :, None], 3, axis=2)
         robot(Frame(3 * LAP + i, (3 * LAP + i) / 20.0, image, Velocity(0.0, 0.0)))
-    after = robot.localiser.state_dict()
+    after = robot.tracker.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
@@ -194,8 +194,8 @@ def test_a_stored_brain_goes_on_bit_for_bit(three_laps, tmp_path):
 
 
 def test_damaged_evidence_is_a_fault(three_laps):
-    state = {n: v.numpy() for n, v in three_laps[0].localiser.state_dict().items()}
-    check = type(three_laps[0].localiser).faults
+    state = {n: v.numpy() for n, v in three_laps[0].tracker.state_dict().items()}
+    check = type(three_laps[0].tracker).faults
     n = three_laps[0].map.n
     assert not list(check(state, n))
     assert list(check(state | {"evidence.made": np.zeros(n + 1, np.int64)}, n))
@@ -221,5 +221,5 @@ def test_two_real_laps_close(shared):
     assert sizes[2] <= 1.15 * sizes[1]
     made = robot.map.experiences["first_frame"].numpy()
     off = abs((phase[899] - phase[made[result.experience]] + 0.5) % 1 - 0.5)
-    assert robot.localiser.tracks
+    assert robot.tracker.tracks
     assert off < 0.1
