@@ -187,7 +187,8 @@ class NavigationBrain(BrainState):
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)
         gap = accepted.gap
-        alarm = view is not None and self.continuity.breaks(view) and self._detects
+        change, broken = (0.0, False) if view is None else self.continuity.compare(view)
+        alarm = broken and self._detects
         if gap or alarm:
             if gap or self.tracker is None:
                 self.start_new_map("gap" if gap else "kidnapped")
@@ -199,19 +200,21 @@ class NavigationBrain(BrainState):
         if view is not None and self.tracker is None:
             match = self.view.match_or_learn(view)
         elif view is not None:
-            match, tracking = self._track(view, Motion(*velocity, dt_s), alarm)
+            match, tracking = self._track(view, Motion(*velocity, dt_s), change, alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
         motion = Motion(*velocity, dt_s)
         return StepInput(frame.index, motion, match, frame.heading_rad, tracking=tracking)
 
-    def _track(self, view: np.ndarray, motion: Motion, alarm: bool) -> tuple[ViewMatch, Tracking]:
+    def _track(
+        self, view: np.ndarray, motion: Motion, change: float, alarm: bool
+    ) -> tuple[ViewMatch, Tracking]:
         """Localise the robot by the sequence of views; store a view of a place that is unknown."""
         assert self.tracker is not None
         templates = self.map.experiences.array("template")
         errors, headings = self.view.compare(view)
         of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
-        found = self.tracker.judge(of_experience, self.map, motion, self.continuity.change, alarm)
+        found = self.tracker.judge(of_experience, self.map, motion, change, alarm)
         if found.kind == "kidnapped":
             self.start_new_map("kidnapped")
             return self.view.match_or_learn(view), Tracking("explore", self.map.current)

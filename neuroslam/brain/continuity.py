@@ -1,6 +1,7 @@
 """Detection of kidnapping: a sudden change of view, larger than the changes while driving."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,6 +35,18 @@ class Change(Scalars):
     turned: float
 
 
+class Comparison(NamedTuple):
+    """A view beside the one before.
+
+    Attributes:
+        change: Mean difference at the best shift; 0 for the first view.
+        broken: Whether driving cannot explain it.
+    """
+
+    change: float
+    broken: bool
+
+
 class Continuity(AboutNow):
     r"""Decides from two successive views whether the robot was kidnapped between them.
 
@@ -53,12 +66,11 @@ class Continuity(AboutNow):
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
         self.geometry = Geometry.of(config.view)
         self.state = Change(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
-        self.change = 0.0  # between the last two views
         n_pixels = config.view.template_width * config.view.template_height
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 
-    def breaks(self, view: np.ndarray) -> bool:
-        """Return whether the change since the previous view is a kidnapping; store the view.
+    def compare(self, view: np.ndarray) -> Comparison:
+        """Return the change since the previous view, and whether it is a kidnapping; store the view.
 
         Args:
             view: View from :meth:`~neuroslam.view.templates.LocalViewCells.encode`.
@@ -67,9 +79,9 @@ class Continuity(AboutNow):
         before, self.before = self.before, torch.from_numpy(query.reshape(-1))
         s.frames += 1
         if s.frames == 1:
-            return False
+            return Comparison(0.0, False)
         apart = distances(before.numpy(force=True)[None], query, self.geometry).min()
-        self.change = change = float(apart) / (255.0 * self.geometry.n_pixels)
+        change = float(apart) / (255.0 * self.geometry.n_pixels)
         broken = (
             s.frames > _SETTLED
             and change > max(self.threshold, self.factor * s.usual)
@@ -78,7 +90,7 @@ class Continuity(AboutNow):
         if not broken:
             step = max(_STEP, 1.0 / s.frames) * max(s.usual, 0.05 * self.threshold)
             s.usual += math.copysign(step, change - s.usual)
-        return broken
+        return Comparison(change, broken)
 
     def moved(self, velocity: Velocity, dt_s: float) -> None:
         """Store the turn of the robot for the next comparison."""

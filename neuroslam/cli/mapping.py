@@ -108,7 +108,7 @@ def _estimated(
 ) -> tuple["BrainConfig", str | None]:
     """Return the preset ``auto`` with what is estimated from the first laps of the source.
 
-    Without a preset, a source that has no pictures keeps the settings that it has.
+    Without a preset, a source that is too short, or has no pictures, keeps the settings it has.
     """
     from neuroslam.runs.run import resolve_config
     from neuroslam.sensors import open_source
@@ -119,9 +119,10 @@ def _estimated(
         return settings, None
     automatic = resolve_config("auto", config, given)
     estimates = estimate(opened, automatic, stop)
-    if estimates.values or preset is not None:
-        for note in estimates.notes:
-            say(note)
+    if preset is None and not estimates.values:
+        return settings, None
+    for note in estimates.notes:
+        say(note)
     return resolve_config("auto", config, given, estimated=estimates.values), "auto"
 
 

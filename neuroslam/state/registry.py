@@ -20,7 +20,7 @@ BRAIN_NAMES = frozenset({
     "about", "clock", "compass", "config", "continuity", "half_taken", "landmarks_m", "leader",
     "map", "merge", "navigation", "not_joined", "odometry", "parts", "place", "populations",
     "pose_cells", "recognition", "restore", "semantic", "sessions", "start_new_map", "store",
-    "stored", "view",
+    "stored", "tracker", "view",
 })  # fmt: skip
 """Attributes that every brain has, or that populations of the package are: no one else's name."""
 

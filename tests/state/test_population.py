@@ -590,8 +590,8 @@ def test_a_leader_of_ones_own_that_finds_no_common_place_says_why(squares, tmp_p
     run(tmp_path / "a.csv", tmp_path / "b", squares, tensorboard=False, start=1)
     first, second = (load_brain(tmp_path / n / "brain.safetensors") for n in "ab")
     second.squares.squares = second.squares.squares + 100
-    save_brain(second, tmp_path / "b" / "brain.safetensors")
-    merged, (report,) = merge_runs(tmp_path / "a", tmp_path / "b", tmp_path / "c")
+    save_brain(second, tmp_path / "b.safetensors")
+    merged, (report,) = merge_runs(tmp_path / "a", tmp_path / "b.safetensors", tmp_path / "c")
     assert merged is None
     assert report.reason == "they have no square in common"
     assert first.map.n
