@@ -31,6 +31,9 @@ MIN_APART = 0.8
 MAX_GROWTH = 0.8
 """Growth on known ground, relative to the first lap, from which loops do not close."""
 
+MAX_ERROR = 0.1
+"""Distance of revisits, relative to the diagonal, from which a map does not close."""
+
 MIN_ASPECT = 0.6
 """Aspect of a map, relative to the median of all, below which it is squashed."""
 
@@ -157,20 +160,28 @@ def score(
     at = track[np.searchsorted(mapped.frames, keys).clip(max=len(track) - 1)]
     known = track[np.isfinite(track[:, 0])]
     diagonal = float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) else 0.0
-    trial = Trial(
+    return Trial(
         name, config, len(known) / len(track), len(brain.sessions.sessions) - 1,
         _error(at, found.same, diagonal), _wrong_links(brain, keys, found),
         _growth(brain, keys, found), _apart(at, found.other, diagonal), _aspect(known),
         brain.map.n, brain.view.n, track, mapped.sizes,
     )  # fmt: skip
-    n = len(track)
-    why = f"given up after {counted(n, 'frame')}: it grows much faster" if mapped.stopped else ""
-    return replace(trial, refused=why)
+
+
+def given_up(name: str, config: BrainConfig, mapped: Mapped) -> Trial:
+    """Return a candidate that was stopped early, without figures."""
+    unknown = math.nan
+    why = f"grows much faster, stopped after {counted(len(mapped.frames), 'frame')}"
+    return Trial(
+        name, config, unknown, 0, unknown, unknown, unknown, unknown, unknown,
+        mapped.brain.map.n, mapped.brain.view.n, mapped.track_xy, mapped.sizes, why,
+    )  # fmt: skip
 
 
 def refuse(trials: list[Trial]) -> list[Trial]:
     """Return the trials, with the reason where a map cannot be right."""
-    usual = float(np.nanmedian([trial.aspect for trial in trials])) if trials else 0.0
+    whole = [trial.aspect for trial in trials if not math.isnan(trial.aspect)]
+    usual = float(np.median(whole)) if whole else 0.0
     return [one if one.refused else replace(one, refused=_fault(one, usual)) for one in trials]
 
 
@@ -179,6 +190,8 @@ def _fault(trial: Trial, usual_aspect: float) -> str:
         return f"{100 * trial.on_map:.0f} % of the frames on one map"
     if trial.apart < MIN_APART:
         return f"collapsed: {100 * (1 - trial.apart):.0f} % of different places coincide"
+    if trial.error > MAX_ERROR:
+        return f"open: revisits are {100 * trial.error:.0f} % of the diagonal apart"
     if trial.growth > MAX_GROWTH:
         return f"grows on known ground as on the first lap ({trial.growth:.2f} of it)"
     if trial.aspect < MIN_ASPECT * usual_aspect:
@@ -239,7 +252,7 @@ def _growth(brain: NavigationBrain, keys: np.ndarray, found: Revisits) -> float:
         return math.nan
     lap_frames = keys[min(lap, len(keys) - 1)] - begins
     early = float((first < begins + lap_frames).sum()) / max(1, lap_frames)
-    return float((first >= later).sum()) / (ends - later) / max(early, 1e-9)
+    return float((first >= later).sum() / (ends - later) / max(early, 1e-9))
 
 
 FIGURES = {
@@ -251,6 +264,12 @@ FIGURES = {
 }
 """Figures that decide, smaller for a better map: how much larger still counts as equal, and how
 much smaller is clearly better."""
+
+
+def cost(one: Trial) -> float:
+    """Return the sum of a map's figures, each in units of what is clear."""
+    known = ((figure(one), clear) for figure, _, clear in FIGURES.values())
+    return sum(value / clear for value, clear in known if not math.isnan(value))
 
 
 def better_by(one: Trial, than: Trial) -> dict[str, float]:

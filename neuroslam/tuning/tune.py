@@ -14,6 +14,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.style import save
 from neuroslam.figures.tuning import plot_tuning
 from neuroslam.runs.files import write_text
+from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import Source, open_source
 from neuroslam.state.registry import leading_class
 from neuroslam.threads import limit_threads
@@ -22,7 +23,7 @@ from neuroslam.tuning.candidates import automatic, candidates, field_by_revisits
 from neuroslam.tuning.drive import Drive, key_frames, read_drive
 from neuroslam.tuning.motion import FieldOfView
 from neuroslam.tuning.revisits import Revisits, differences_of, find_revisits, fitting
-from neuroslam.tuning.score import Mapped, Trial, better_by, refuse, score
+from neuroslam.tuning.score import Mapped, Trial, better_by, cost, given_up, refuse, score
 from neuroslam.view.features import FeatureEncoder
 from neuroslam.view.preprocess import encode
 
@@ -109,6 +110,8 @@ def tune(
         RunError: If the source is live, the brain has no pose cells, or ``out`` cannot be written.
     """
     out, start = Path(out), config or BrainConfig()
+    if assignments:
+        start = resolve_config(assignments=tuple(assignments), base=config)
     if not leading_class(start).needs_views:
         raise RunError(
             f"cells are {'+'.join(start.cells)}, expected pose: tuning is for brains that match "
@@ -178,8 +181,12 @@ def _tune(
         report(f"mapping with {name}")
         frames = source.frames(stop=last, on_bad_frame=lambda fault: None)
         mapped = Mapped(config, frames, drive.views, sizes)
-        sizes = mapped.sizes if sizes is None else sizes
+        if mapped.stopped:
+            tuning.trials.append(given_up(name, config, mapped))
+            continue
         tuning.trials.append(score(name, config, mapped, indices, revisits))
+        if name == "auto" and not refuse(tuning.trials)[0].refused:
+            sizes = mapped.sizes
     tuning.trials = refuse(tuning.trials)
     best, tuning.verdict = choose(tuning.trials)
     tuning.config, tuning.chosen = best.config, best.name
@@ -196,7 +203,7 @@ def choose(trials: Sequence[Trial]) -> tuple[Trial, str]:
     """
     first, others = trials[0], [trial for trial in trials[1:] if not trial.refused]
     if first.refused and others:
-        best = min(others, key=lambda one: one.error)
+        best = min(others, key=cost)
         return best, f"{best.name}: the map of {first.name} is refused ({first.refused})"
     if first.refused:
         return first, (
