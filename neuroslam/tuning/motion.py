@@ -24,6 +24,9 @@ FIELDS_OF_VIEW_DEG = np.arange(30.0, 201.0, 1.0)
 _DEPTH = 0.3
 """Depth of a valley below its lower side, of at most 2."""
 
+_MARGIN = 0.05
+"""Difference of the errors of two valleys that are equally deep."""
+
 _WORST = 0.5
 """Error of an estimate above which the turns of revisits contradict each other."""
 
@@ -85,7 +88,8 @@ def field_of_view(shifts: Shifts, width: int, revisits: np.ndarray) -> FieldOfVi
             about one lap lies between them, ``(m, 2)``.
 
     Returns:
-        The deepest valley of the error; ``None`` if there is none, or its error is large.
+        The first of the deepest valleys of the error; ``None`` if there is none, or its error is
+        large.
     """
     if not len(revisits):
         return None
@@ -93,8 +97,17 @@ def field_of_view(shifts: Shifts, width: int, revisits: np.ndarray) -> FieldOfVi
     turned = turned[revisits[:, 1]] - turned[revisits[:, 0]]
     error = (1.0 - np.cos(np.outer(np.deg2rad(FIELDS_OF_VIEW_DEG), turned))).mean(axis=1)
     smooth = cv2.blur(error[:, None], (1, 5), borderType=cv2.BORDER_REPLICATE)[:, 0]
-    lowest = int(smooth.argmin())
-    sides = smooth[: lowest + 1].max(), smooth[lowest:].max()
-    if smooth[lowest] > _WORST or min(sides) < smooth[lowest] + _DEPTH:
+    valleys = [i for i in range(1, len(smooth) - 1) if _is_valley(smooth, i)]
+    if not valleys:
         return None
-    return FieldOfView(float(FIELDS_OF_VIEW_DEG[lowest]), error, shifts.region)
+    # Twice the true field of view gives two full turns a lap, so the first valley is right.
+    limit = smooth[valleys].min() + _MARGIN
+    first = next(i for i in valleys if smooth[i] <= limit)
+    return FieldOfView(float(FIELDS_OF_VIEW_DEG[first]), error, shifts.region)
+
+
+def _is_valley(error: np.ndarray, i: int) -> bool:
+    """Return whether an error is small, and rises on both sides."""
+    lower_side = min(error[:i].max(), error[i:].max())
+    lowest = error[i] <= error[i - 1] and error[i] < error[i + 1]
+    return bool(lowest and error[i] <= _WORST and lower_side >= error[i] + _DEPTH)

@@ -138,7 +138,8 @@ class Mapped:
                     self.stopped = True
                     break
         names = ("session", "number", "dx_m", "dy_m", "dtheta_rad")
-        trace = dict(zip(names, np.array(rows).T, strict=True))
+        columns = np.array(rows).T
+        trace: dict[str, np.ndarray] = {name: columns[i] for i, name in enumerate(names)}
         self.frames = np.array(indices)
         self.sizes = np.array(grown)
         self.track_xy = trajectory(brain, trace)[:, :2]
