@@ -61,7 +61,7 @@ class Trial:
         experiences: Number of experiences.
         templates: Number of templates.
         track_xy: Position of each frame on the map, m, ``(n, 2)``; NaN off the map.
-        sizes: Experiences and templates after each frame, ``(n,)``.
+        sizes: Experiences and templates made up to each frame, in all its maps, ``(n,)``.
         refused: Why the map cannot be right; empty if it can.
     """
 
@@ -121,7 +121,7 @@ class Mapped:
 
         alone = config.model_copy(update={"cells": ("pose",)})
         self.brain = brain = NavigationBrain(alone, features=None if views is None else look_up)
-        rows, grown, indices = [], [], []
+        rows, grown, indices, made = [], [], [], 0
         self.stopped = False
         with torch.inference_mode():
             for frame in frames:
@@ -132,7 +132,8 @@ class Mapped:
                     continue
                 indices.append(frame.index)
                 rows.append((*brain.map.origin, *brain.map.offset))
-                grown.append(result.n_experiences + result.n_templates)
+                made += (result.action == "create") + result.view.is_new
+                grown.append(made)
                 k = len(grown) - 1
                 if sizes is not None and grown[k] > _LARGER * sizes[min(k, len(sizes) - 1)] + _ROOM:
                     self.stopped = True

@@ -208,10 +208,13 @@ def test_a_refused_map_of_auto_is_replaced_by_any_that_can_be_right():
 
 
 def test_a_map_that_grows_much_faster_is_given_up_early(drive):
-    config = BrainConfig(view={"threshold": 1e-6})
-    mapped = Mapped(config, drive.frames, sizes=np.full(len(drive.frames), 5))
-    assert mapped.stopped
-    assert len(mapped.frames) < 130
+    """Every frame is new to it, or even a kidnapping."""
+    for kidnapped in ("ignore", "detect"):
+        config = BrainConfig(view={"threshold": 1e-6}, sessions={"kidnapped": kidnapped})
+        mapped = Mapped(config, drive.frames, sizes=np.full(len(drive.frames), 5))
+        assert mapped.stopped
+        assert len(mapped.frames) < 130
+    config = BrainConfig(sessions={"kidnapped": "ignore"})
     assert not Mapped(config, drive.frames[:150], sizes=np.full(150, 500)).stopped
 
 
