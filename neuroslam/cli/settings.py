@@ -1,5 +1,6 @@
 """Commands about the parameters of a brain: tune, presets."""
 
+import math
 from itertools import takewhile
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 from neuroslam.cli.options import Assignments, ConfigFile, Offset, Out, Preset, Source, Stop
 from neuroslam.cli.output import say
 from neuroslam.cli.progress import show_stages
-from neuroslam.cli.tables import new_table, shown
+from neuroslam.cli.tables import new_table
 
 
 def tune_command(
@@ -23,12 +24,17 @@ def tune_command(
         bool, typer.Option("--overwrite", help="Replace an earlier tuning in the folder.")
     ] = False,
 ) -> int:
-    """Tune parameters from the images of a SOURCE, without ground truth; write a config."""
+    """Compare configs for the images of a SOURCE, without ground truth; write the best known.
+
+    The estimates of the preset auto are compared with other configs, and with that of --preset or
+    --config; what --set sets holds for all.
+    """
     from neuroslam.runs.clocks import resolve_offset
     from neuroslam.runs.run import resolve_config
     from neuroslam.tuning import tune
 
-    settings = resolve_config(preset, config, tuple(assignments or ()))
+    given = tuple(assignments or ())
+    settings = resolve_config(preset, config, given)
     source, found = resolve_offset(source, offset, settings)
     for note in found:
         say(note)
@@ -36,24 +42,23 @@ def tune_command(
         tuning = tune(
             source,
             out,
-            settings,
+            settings if preset not in (None, "auto") or config is not None else None,
+            assignments=given,
             stop=stop,
             overwrite=overwrite,
             on_stage=on_stage,
         )
-    table = new_table("parameter", "before", "tuned", "reason")
-    for key, (before, found, why) in tuning.changes.items():
-        table.add_row(key, *("none" if v is None else shown(v) for v in (before, found)), why)
-    say(table)
     for note in tuning.notes:
         say(note)
-    for name, trial in (("before", tuning.before), ("tuned", tuning.after)):
-        if trial is None:
-            continue
-        say(
-            f"{name}: {trial.n_experiences} experiences, {trial.n_links} links, "
-            f"inconsistency {shown(trial.inconsistency) or 'unknown'} (0: consistent, 1: useless)"
-        )
+    table = new_table(
+        "candidate", "frames on the map", "error", "wrong loop links", "growth", "experiences",
+        "refused",
+    )  # fmt: skip
+    for one in tuning.trials:
+        shares = (one.on_map, one.error, one.wrong_links, one.growth)
+        percent = ("unknown" if math.isnan(x) else f"{100 * x:.1f} %" for x in shares)
+        table.add_row(one.name, *percent, str(one.experiences), one.refused)
+    say(table)
     say(tuning.verdict)
     say(f"Written: {out}; next: neuroslam run {source} --config {out}/config.toml -o map")
     return 0

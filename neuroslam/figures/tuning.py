@@ -1,4 +1,4 @@
-"""The figure of a tuning: candidates, the choice, and the map before and after."""
+"""The figure of a tuning: its evidence, and the maps of the candidates."""
 
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,7 +21,6 @@ from neuroslam.figures.style import (
     STYLE,
     new_figure,
     plain_text,
-    write_decimals,
     write_title,
 )
 
@@ -33,51 +32,46 @@ class Tuning(Protocol):
     """
 
     config: BrainConfig
+    chosen: str
     keys: np.ndarray
-    changes: dict[str, tuple[Any, Any, str]]
     revisits: Any
-    views: list[Any]
     motion: Any
     trials: list[Any]
-    before: Any
-    after: Any
+    differences: Any
 
 
 def plot_tuning(tuning: Tuning, name: str) -> Figure:
-    """Draw the candidates and choices of a tuning, and the map before and after.
+    """Draw the evidence of a tuning and the maps of its candidates, the chosen one first.
 
     Args:
         tuning: A finished tuning.
         name: Name of the source, for the title.
 
     Raises:
-        ValueError: If a map, before or after, is missing.
+        ValueError: If there is no map.
     """
-    before, after = tuning.before, tuning.after
-    if before is None or after is None:
-        raise ValueError("plot_tuning: the tuning has no map before or after; finish it first")
+    if not tuning.trials or tuning.differences is None:
+        raise ValueError("plot_tuning: the tuning has no map yet; finish it first")
     n, found = len(tuning.keys), len(tuning.revisits.same)
     title = f"{Path(name).name}: {100 * found / n:.0f} % of {n} key frames revisit a place"
+    ordered = sorted(tuning.trials, key=lambda trial: trial.name != tuning.chosen)
     with mpl.rc_context(STYLE):
         figure = new_figure(13.0, 8.0, plain_text(title))
         axes = figure.subplots(2, 3)
         _draw_differences(axes[0, 0], tuning)
-        _draw_templates(axes[0, 1], tuning)
-        _draw_field_of_view(axes[0, 2], tuning)
-        _draw_maps(axes[1, 0], tuning)
-        unit = "arbitrary unit" if "odometry.speed_scaling_m_s" in tuning.changes else "m"
-        turned = _turned(after.track_xy, before.track_xy)
-        _draw_track(axes[1, 1], _counts(before), before.track_xy, "Map before", unit)
-        _draw_track(axes[1, 2], _counts(after), turned, "Map found", unit)
-        if turned is not after.track_xy:
-            axes[1, 2].set_xlabel(f"x ({unit}), aligned to the map before")
+        _draw_field_of_view(axes[0, 1], tuning)
+        maps = [axes[0, 2], *axes[1]]
+        for trial, panel in zip(ordered, maps, strict=False):
+            _draw_track(panel, trial, trial.name == tuning.chosen, ordered[0].track_xy)
+        for panel in maps[len(ordered) :]:
+            panel.set_axis_off()
     return figure
 
 
 def _draw_differences(axes: Axes, tuning: Tuning) -> None:
-    score, threshold = tuning.views[0], tuning.config.view.threshold
-    kinds = (("neighbours in time", score.neighbours, ODOMETRY), ("revisits of a place",
-             score.revisits, MAP), ("different places", score.others, LOOP))  # fmt: skip
+    threshold = tuning.config.view.threshold
+    names = ("neighbours in time", "revisits of a place", "different places")
+    kinds = list(zip(names, tuning.differences, (ODOMETRY, MAP, LOOP), strict=True))
     top = max(float(values.max()) for _, values, _ in kinds if len(values))
     bins = np.linspace(0.0, top, 60)
     for label, values, colour in kinds:
@@ -92,60 +86,18 @@ def _draw_differences(axes: Axes, tuning: Tuning) -> None:
     axes.legend()
 
 
-def _draw_templates(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Place recognition by single templates")
-    if not len(tuning.revisits.same):
-        _write_none(axes, "no revisits in this drive")
-        return
-    axes.set(xlabel="average precision", xlim=(0.0, 1.15))
-    axes.set_xticks(np.linspace(0.0, 1.0, 6))
-    seen: dict[str, float] = {}
-    for score in tuning.views:
-        config = score.config
-        top, end = (0, -1) if config.crop is None else config.crop[2:]
-        rows = f"rows {top} to {end}" if end >= 0 else f"rows from {top}" if top else "all rows"
-        patch = f", patch {config.patch_radius}" if config.patch_radius else ""
-        of = "" if config.features == "grey" else f"{config.features}\n"
-        of = f"{config.orientations} orientations\n" if config.orientations else of
-        label = f"{of}{config.template_width} x {config.template_height}, {rows}{patch}"
-        seen.setdefault(label, score.average_precision)
-    chosen = next(iter(seen))
-    ordered = sorted(seen.items(), key=lambda item: item[1])
-    colours = [MAP if label == chosen else "#b9cfe0" for label, _ in ordered]
-    labels, scores = zip(*ordered, strict=True)
-    bars = axes.barh(labels, scores, height=0.7, color=colours)
-    axes.bar_label(bars, fmt="%.3f", padding=2, fontsize=7)
-    axes.grid(axis="y", visible=False)
-    axes.tick_params(axis="y", labelsize=7)
-
-
 def _draw_field_of_view(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Closure of loops in heading")
+    axes.set_title("Closure of revisits in heading")
     motion = tuning.motion
     if motion is None:
-        _write_none(axes, "not determined by this drive")
+        _write_none(axes, "revisits do not determine\nthe field of view")
         return
     axes.set(xlabel="horizontal field of view (°)", ylabel="mean of 1 - cos(turn of a loop)")
     axes.plot(motion.tried_deg, motion.error, color=MAP)
-    axes.axvline(motion.fov_deg, color=INK, ls="--", lw=1.0, label=f"{motion.fov_deg:.0f}°")
+    used = tuning.config.odometry.fov_deg
+    axes.axvline(motion.fov_deg, color=LOOP, ls=":", lw=1.4, label=f"valley: {motion.fov_deg:.0f}°")
+    axes.axvline(used, color=INK, ls="--", lw=1.0, label=f"chosen: {used:.0f}°")
     axes.set_ylim(bottom=0.0)
-    axes.legend()
-
-
-def _draw_maps(axes: Axes, tuning: Tuning) -> None:
-    axes.set_title("Inconsistency of maps")
-    if not tuning.trials:
-        _write_none(axes, "no revisits in this drive")
-        return
-    axes.set(xlabel="match threshold of views", ylabel="distance of revisits / of other pairs")
-    energies = sorted({trial.config.pose_cells.inject_energy for trial in tuning.trials})
-    for energy, colour in zip(energies, (OTHER, MAP, LOOP, ODOMETRY), strict=False):
-        some = [t for t in tuning.trials if t.config.pose_cells.inject_energy == energy]
-        axes.plot([t.config.view.threshold for t in some], [t.inconsistency for t in some],
-                  ".-", color=colour, label=f"injection {energy:g}")  # fmt: skip
-    axes.axvline(tuning.config.view.threshold, color=INK, ls="--", lw=1.0, label="chosen")
-    axes.set_yscale("log")
-    write_decimals(axes.yaxis)
     axes.legend()
 
 
@@ -156,23 +108,30 @@ def _write_none(axes: Axes, why: str) -> None:
 
 def _turned(track_xy: np.ndarray, onto_xy: np.ndarray) -> np.ndarray:
     """Turn a track to align it with another of the same frames, if they fix a rotation."""
+    n = min(len(track_xy), len(onto_xy))
+    both = np.isfinite(track_xy[:n, 0]) & np.isfinite(onto_xy[:n, 0])
     try:
-        return np.asarray(track_xy @ align(track_xy, onto_xy, "rigid").rotation.T)
-    except MapError:  # other frames, or a robot that stood still
+        fit = align(track_xy[:n][both], onto_xy[:n][both], "rigid")
+    except MapError:  # a robot that stood still
         return track_xy
+    return np.asarray(track_xy @ fit.rotation.T)
 
 
-def _counts(trial: Any) -> str:  # noqa: ANN401 - see Tuning
-    off = trial.inconsistency
-    score = "" if np.isnan(off) else f", inconsistency {off:.3f}"
-    return f"{counted(trial.n_experiences, 'experience')}{score}"
+def _figures(trial: Any) -> str:  # noqa: ANN401 - see Tuning
+    if trial.refused:
+        return f"refused: {trial.refused}"
+    error = "" if np.isnan(trial.error) else f"error {100 * trial.error:.1f} % of the diagonal, "
+    return f"{error}{counted(trial.experiences, 'experience')}"
 
 
-def _draw_track(axes: Axes, counts: str, track_xy: np.ndarray, title: str, unit: str) -> None:
-    write_title(axes, title, counts)
-    axes.plot(*track_xy.T, color=MAP, lw=0.6)
-    axes.plot(*track_xy[0], "o", color=OTHER, ms=5, label="start")
-    axes.plot(*track_xy[-1], "s", color=INK, ms=4, label="end")
-    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+def _draw_track(axes: Axes, trial: Any, chosen: bool, onto_xy: np.ndarray) -> None:  # noqa: ANN401
+    write_title(axes, trial.name + (" (chosen)" if chosen else ""), _figures(trial))
+    track_xy = _turned(trial.track_xy, onto_xy)
+    axes.plot(*track_xy.T, color=MAP if chosen else ODOMETRY, lw=0.6)
+    placed = track_xy[np.isfinite(track_xy[:, 0])]
+    if len(placed):
+        axes.plot(*placed[0], "o", color=OTHER, ms=5, label="start")
+        axes.plot(*placed[-1], "s", color=INK, ms=4, label="end")
+        axes.legend()
+    axes.set(xlabel="x (arbitrary unit)", ylabel="y (arbitrary unit)")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend()

@@ -12,7 +12,7 @@ Three estimates, none of which needs ground truth or a map:
 
 import math
 from collections.abc import Iterator
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import cv2
@@ -22,9 +22,9 @@ from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.config.sections import Region, ViewConfig
 from neuroslam.errors import BadFrame, counted
-from neuroslam.odometry.visual import column_sums, match_profiles
 from neuroslam.sensors import Source
 from neuroslam.sensors.grey import to_grey
+from neuroslam.tuning.motion import measure_shifts
 from neuroslam.tuning.revisits import fitting
 from neuroslam.types import Frame
 from neuroslam.view.preprocess import encode
@@ -37,13 +37,15 @@ FIRST = 600
 MOST = 6000
 """Frames after which a drive that never revisits a place is taken as it is."""
 
+SHARE = 0.58
+"""Share of the mean match error of far frames that is the threshold."""
+
 _FEWEST = 100
 _WIDTH_PX = 160
 _NEAR_S = 0.1  # two frames so far apart in time show one place
 _FAR_S = 5.0  # and so far apart, two places
 _BANDS = ((0.0, 0.5), (0.0, 2 / 3), (1 / 6, 2 / 3), (0.0, 1.0))
 _BETTER = 0.1  # by which another band must be better: bands overlap
-_SHARE = 0.58  # of the far error, that is the threshold
 _LAPS = 60  # revisits that determine the field of view
 _LAP_TURN = (0.4, 2.5)  # measured turn of a lap, in full turns, that can be one turn
 _SPREAD = 0.15  # of the turns of laps, relative, beyond which they determine nothing
@@ -56,10 +58,12 @@ class Estimates(NamedTuple):
     Attributes:
         values: Sections and keys of a config, as a TOML file has them.
         notes: One line for each estimate, or the reason why there is none.
+        other_view: Keys of the section ``view`` for the second-best band of the image, if any.
     """
 
     values: dict[str, dict[str, Any]]
     notes: list[str]
+    other_view: dict[str, Any] | None = None
 
 
 class _Reduced(NamedTuple):
@@ -103,17 +107,10 @@ def estimate(source: Source, config: BrainConfig, stop: int | None = None) -> Es
         return Estimates({}, ["auto: the pictures hardly change: nothing is estimated"])
     span_s = first[-1].time_s - first[0].time_s
     rate_hz = (len(first) - 1) / span_s
-    view, far, near = _best_view(pictures, config.view, rate_hz)
-    scaled = {
-        "crop": _scaled(view.crop, reduced.factor),
-        "template_width": view.template_width,
-        "template_height": view.template_height,
-        "patch_radius": view.patch_radius,
-        "shift_match": view.shift_match,
-        "normalisation": view.normalisation,
-        "threshold": _rounded(_SHARE * far),
-    }
-    scaled = {name: value for name, value in scaled.items() if value is not None}
+    (view, far, near), second = _best_views(pictures, config.view, rate_hz)
+    scaled, other = (
+        _section(one, mean, reduced.factor) for one, mean, _ in ((view, far, near), second)
+    )
     crop = scaled.get("crop")
     seen = "the whole image" if crop is None else f"rows {crop[2]} to {crop[3]}"
     notes = [
@@ -122,7 +119,7 @@ def estimate(source: Source, config: BrainConfig, stop: int | None = None) -> Es
     ]
     values: dict[str, dict[str, Any]] = {"view": scaled}
     if first[-1].velocity is not None and config.odometry.use != "visual":
-        return Estimates(values, notes)
+        return Estimates(values, notes, other)
     small = view.model_copy(update={"threshold": scaled["threshold"]})
     motion = _speed_scale(pictures, small, config, rate_hz, reduced)
     values["odometry"] = motion
@@ -131,7 +128,7 @@ def estimate(source: Source, config: BrainConfig, stop: int | None = None) -> Es
     notes.append(why)
     if field_deg is not None:
         motion["fov_deg"] = field_deg
-    return Estimates(values, notes)
+    return Estimates(values, notes, other)
 
 
 def _reduced(source: Source, config: BrainConfig, stop: int | None) -> _Reduced | None:
@@ -162,10 +159,18 @@ def _moving(frames: list[Frame]) -> np.ndarray:
     return pictures[1:][steps > 0.2 * np.median(steps)]
 
 
-def _best_view(
+def _section(view: ViewConfig, far: float, factor: int) -> dict[str, Any]:
+    """Return the keys of a view for the source's pictures; the crop only where there is one."""
+    names = ("template_width", "template_height", "patch_radius", "shift_match", "normalisation")
+    found = {name: getattr(view, name) for name in names} | {"threshold": _rounded(SHARE * far)}
+    crop = _scaled(view.crop, factor)
+    return found if crop is None else {"crop": crop, **found}
+
+
+def _best_views(
     pictures: np.ndarray, config: ViewConfig, rate_hz: float
-) -> tuple[ViewConfig, float, float]:
-    """Return the view that separates near from far frames best, and both mean errors."""
+) -> list[tuple[ViewConfig, float, float]]:
+    """Return the two views that separate near from far frames best, each with both mean errors."""
     height, width = pictures.shape[1:]
     near, far = max(1, round(_NEAR_S * rate_hz)), max(2, round(_FAR_S * rate_hz))
     far = min(far, len(pictures) // 3)
@@ -183,7 +188,8 @@ def _best_view(
     for one in found:
         if one[0] > best[0] + _BETTER:
             best = one
-    return best[1], best[2], best[3]
+    second = max((one for one in found if one is not best), key=lambda one: one[0])
+    return [best[1:], second[1:]]
 
 
 def _separation(
@@ -212,9 +218,7 @@ def _speed_scale(
     height, width = pictures.shape[1:]
     region = (0, width, height // 2, height)
     max_shift = max(1, width // 4)
-    sums = [column_sums(picture, region) for picture in pictures]
-    found = [match_profiles(b, a, max_shift)[1] for a, b in pairwise(sums)]
-    speed = np.array(found) / (255.0 * (region[3] - region[2]))
+    speed = measure_shifts(pictures, region, max_shift).difference[1:]
     typical = float(np.median(speed[speed > 0.2 * np.median(speed)]))
     geometry = Geometry.of(view)
     templates = np.stack([to_bytes(encode(p, view).template.T).reshape(-1) for p in pictures])

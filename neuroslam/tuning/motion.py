@@ -1,12 +1,13 @@
-r"""Field of view and image motion of a camera, estimated from loops without ground truth.
+r"""Field of view and image motion of a camera, estimated from revisits without ground truth.
 
 A robot that revisits a place with the same heading has turned by a multiple of the full turn. The
 estimated field of view :math:`f` is the one for which the turns of all revisits agree best,
 
-.. math:: \min_f \; \operatorname{mean} \bigl(1 - \cos(f\, \Delta s / w)\bigr)
+.. math:: J(f) = \operatorname{mean} \bigl(1 - \cos(f\, \Delta s / w)\bigr)
 
 with :math:`\Delta s` the horizontal image shift in between, in pixels, and :math:`w` the width of
-the picture.
+the picture. Where the image measures no net turn, :math:`J` falls to 0 at small :math:`f`: only a
+valley, which rises on both sides, is an estimate.
 """
 
 from itertools import pairwise
@@ -18,9 +19,16 @@ import numpy as np
 from neuroslam.config.sections import Region
 from neuroslam.odometry.visual import column_sums, match_profiles
 
-FIELDS_OF_VIEW_DEG = np.arange(40.0, 181.0, 1.0)
+FIELDS_OF_VIEW_DEG = np.arange(30.0, 201.0, 1.0)
 
-_ERROR_MARGIN = 0.05
+_DEPTH = 0.3
+"""Depth of a valley below its lower side, of at most 2."""
+
+_MARGIN = 0.05
+"""Difference of the errors of two valleys that are equally deep."""
+
+_WORST = 0.5
+"""Error of an estimate above which the turns of revisits contradict each other."""
 
 
 class Shifts(NamedTuple):
@@ -42,17 +50,17 @@ class FieldOfView(NamedTuple):
 
     Attributes:
         fov_deg: The estimate.
-        error: Mean of :math:`1 - \cos` of the turns, for each of ``tried_deg``.
-        shifts: The image shifts that it was estimated from.
+        error: :math:`J` for each of ``FIELDS_OF_VIEW_DEG``.
+        region: Region of the picture whose shifts were used, px.
     """
 
     fov_deg: float
     error: np.ndarray
-    shifts: Shifts
+    region: Region
 
     @property
     def tried_deg(self) -> np.ndarray:
-        """The candidate fields of view."""
+        """The fields of view compared."""
         return FIELDS_OF_VIEW_DEG
 
 
@@ -76,19 +84,30 @@ def field_of_view(shifts: Shifts, width: int, revisits: np.ndarray) -> FieldOfVi
     Args:
         shifts: Image shifts of the whole drive.
         width: Width of the pictures, px.
-        revisits: Pairs of frames that show the same place, ``(m, 2)``.
+        revisits: Pairs of frames that show the same place, each with its nearest revisit, so that
+            about one lap lies between them, ``(m, 2)``.
 
     Returns:
-        The smallest of the best candidates; ``None`` if the loops hold too little turning.
+        The first of the deepest valleys of the error; ``None`` if there is none, or its error is
+        large.
     """
+    if not len(revisits):
+        return None
     turned = np.cumsum(shifts.shift_px) / width
     turned = turned[revisits[:, 1]] - turned[revisits[:, 0]]
-    turns = np.outer(np.deg2rad(FIELDS_OF_VIEW_DEG), turned)
-    error = (1.0 - np.cos(turns)).mean(axis=1)
-    if np.abs(turns).mean() < 1.0:  # a figure of eight closes for any field of view
-        return None
+    error = (1.0 - np.cos(np.outer(np.deg2rad(FIELDS_OF_VIEW_DEG), turned))).mean(axis=1)
     smooth = cv2.blur(error[:, None], (1, 5), borderType=cv2.BORDER_REPLICATE)[:, 0]
-    # Twice the true field of view gives two full turns per lap, so the first minimum is right.
-    first = int(np.argmax(smooth <= smooth.min() + _ERROR_MARGIN))
-    minimum = first + int(np.argmax(np.diff(smooth[first:], append=np.inf) >= 0.0))
-    return FieldOfView(float(FIELDS_OF_VIEW_DEG[minimum]), error, shifts)
+    valleys = [i for i in range(1, len(smooth) - 1) if _is_valley(smooth, i)]
+    if not valleys:
+        return None
+    # Twice the true field of view gives two full turns a lap, so the first valley is right.
+    limit = smooth[valleys].min() + _MARGIN
+    first = next(i for i in valleys if smooth[i] <= limit)
+    return FieldOfView(float(FIELDS_OF_VIEW_DEG[first]), error, shifts.region)
+
+
+def _is_valley(error: np.ndarray, i: int) -> bool:
+    """Return whether an error is small, and rises on both sides."""
+    lower_side = min(error[:i].max(), error[i:].max())
+    lowest = error[i] <= error[i - 1] and error[i] < error[i + 1]
+    return bool(lowest and error[i] <= _WORST and lower_side >= error[i] + _DEPTH)

@@ -39,7 +39,8 @@ class Revisits(NamedTuple):
         limit: Score below which two sequences show the same place.
         doubt: Score above which they show two places; between the two it is not known.
         gap: Key frames nearer than this in time are neighbours, not revisits.
-        same: Pairs of the same place, ``(m, 2)``: the best match of each key frame that has one.
+        same: Pairs of the same place, ``(m, 2)``, the earlier first: each key frame that has any,
+            with its nearest revisit in time.
         other: Pairs of different places, ``(k, 2)``.
     """
 
@@ -86,14 +87,23 @@ def find_revisits(pictures: np.ndarray, n_other: int = 2000) -> Revisits:
     by_chance = reversed_scores.min(axis=1)
     by_chance = by_chance[np.isfinite(by_chance)]
     limit, doubt = np.quantile(by_chance, (CHANCE, 0.5)) if len(by_chance) else (-np.inf, -np.inf)
-    best = scores.argmin(axis=1)
-    found = np.flatnonzero(scores[np.arange(n), best] < limit)
-    same = np.stack([found, best[found]], axis=1)
+    same = _nearest(scores, limit)
     median = np.median(scores[np.isfinite(scores)]) if np.isfinite(scores).any() else 0.0
     i, j = np.nonzero(np.triu(np.isfinite(scores) & (scores > median)))
     some = np.linspace(0, len(i) - 1, min(n_other, len(i))).astype(int)
     other = np.stack([i[some], j[some]], axis=1)
     return Revisits(scores, float(limit), float(doubt), gap, same, other)
+
+
+def _nearest(scores: np.ndarray, limit: float) -> np.ndarray:
+    """Return each key frame with the best match of its last visit before, ``(m, 2)``."""
+    pairs = []
+    for i, row in enumerate(scores):
+        before = np.flatnonzero(row[:i] < limit)
+        if len(before):
+            first = max(0, before[-1] - 2 * _CLOSE)
+            pairs.append((first + int(row[first : before[-1] + 1].argmin()), i))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 def pairwise_differences(templates: np.ndarray, shift: int = 3) -> np.ndarray:
@@ -114,6 +124,26 @@ def pairwise_differences(templates: np.ndarray, shift: int = 3) -> np.ndarray:
         means = torch.cdist(left, right, p=1.0) / (255.0 * left.shape[1])
         best = torch.minimum(best, torch.minimum(means, means.T))
     return best.numpy()
+
+
+def differences_of(templates: np.ndarray, pairs: np.ndarray, shift: int) -> np.ndarray:
+    """Return the mean difference of pairs of templates, the smallest over horizontal shifts.
+
+    Args:
+        templates: In [0, 1], ``(n, height, width)``.
+        pairs: Positions of two templates each, ``(m, 2)``.
+        shift: Largest shift of one against the other, in columns.
+    """
+    a, b = templates[pairs[:, 0]], templates[pairs[:, 1]]
+    width = templates.shape[2]
+    best = np.full(len(pairs), np.inf)
+    for by in range(-shift, shift + 1):
+        left, right = (
+            a[:, :, max(0, by) : width + min(0, by)],
+            b[:, :, max(0, -by) : width - max(0, by)],
+        )
+        np.minimum(best, np.abs(left - right).mean(axis=(1, 2)), out=best)
+    return best
 
 
 def fitting(config: ViewConfig, shape: tuple[int, ...]) -> ViewConfig:
