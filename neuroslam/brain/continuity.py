@@ -70,7 +70,7 @@ class Continuity(AboutNow):
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 
     def compare(self, view: np.ndarray) -> Comparison:
-        """Return the change since the previous view, and whether it is a kidnapping; store the view.
+        """Return the change since the last view, and whether it is a kidnapping; store the view.
 
         Args:
             view: View from :meth:`~neuroslam.view.templates.LocalViewCells.encode`.

@@ -115,10 +115,13 @@ def _estimated(
     from neuroslam.tuning.auto import estimate, has_pictures
 
     opened = open_source(source, settings.frame_rate_hz, settings.view.grey)
-    if preset is None and not has_pictures(opened):
+    plain = settings.view.features == "grey" and not settings.view.orientations
+    if preset is None and not (plain and has_pictures(opened)):
         return settings, None
     automatic = resolve_config("auto", config, given)
     estimates = estimate(opened, automatic, stop)
+    if not plain:  # estimated from grey views
+        estimates.values.pop("view", None)
     if preset is None and not estimates.values:
         return settings, None
     for note in estimates.notes:
