@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -56,6 +56,28 @@ class _Around(Protocol):
     """Finds the experiences some links behind and ahead of one."""
 
     def __call__(self, experience: int, back: int, ahead: int) -> np.ndarray: ...
+
+
+class Seen(NamedTuple):
+    """Evidence of the last frame for a loop closure, as the tracker weighed it.
+
+    Attributes:
+        compared: Number of experiences that were compared.
+        candidate: The one with most evidence, of the other parts of the map while one is tracked.
+        evidence: Its lead over the mean, in standard deviations.
+        rival: That of the best beside it.
+        streak: Frames in a row that agreed on it.
+        passed: Experiences that were passed meanwhile.
+        alike: Match error with it, as a share of the usual one, averaged over these frames.
+    """
+
+    compared: int = 0
+    candidate: int = NO_EXPERIENCE
+    evidence: float = 0.0
+    rival: float = 0.0
+    streak: int = 0
+    passed: int = 0
+    alike: float = 1.0
 
 
 class _State(Scalars):
@@ -128,6 +150,7 @@ class SequenceTracker(Mergeable):
         super().__init__()
         self.config = config
         self.memory = 1.0 - 1.0 / config.memory_frames
+        self.seen = Seen()
         self.closeness = np.empty(0)  # match errors of this frame, as a share of their mean
         self.new_view: float | None = None  # match error of a new view in this frame, where known
         # Of every experience: accumulated cost, and number of the frame that made it.
@@ -202,7 +225,7 @@ class SequenceTracker(Mergeable):
         if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
             s.mode, s.doubts = Mode.DOUBTS, 0
             self._forget()
-        self.new_view = None
+        self.new_view, self.seen = None, Seen()
         if not map_.n:
             return Tracking("explore", current)
         if not (way_m or alarm):
@@ -212,7 +235,8 @@ class SequenceTracker(Mergeable):
         doubting = s.mode >= Mode.DOUBTS
         old = self.evidence.array("made") <= s.frames - c.recent_frames
         compared = np.ones(map_.n, dtype=bool) if doubting else old
-        if compared.sum() < c.min_experiences:
+        self.seen = Seen(int(compared.sum()))
+        if self.seen.compared < c.min_experiences:
             self._forget()
             s.mode = Mode.EXPLORES
             return Tracking("explore", current)
@@ -314,8 +338,9 @@ class SequenceTracker(Mergeable):
     def _confirmed(self, best: int, cost: float, rival: float, around: _Around) -> bool:
         """Count frames in a row that agree, along the links, on where the robot is."""
         s, c = self.state, self.config
+        seen = self.seen._replace(candidate=best, evidence=-float(cost), rival=-float(rival))
         if not (cost < -c.believe and cost < rival - c.margin):
-            s.streak, s.candidate = 0, NO_EXPERIENCE
+            s.streak, s.candidate, self.seen = 0, NO_EXPERIENCE, seen
             return False
         if s.candidate == NO_EXPERIENCE or not around(s.candidate, 1, _AHEAD)[best]:
             s.streak, s.passed, s.began, s.alike = 0, 0, best, 0.0
@@ -323,8 +348,10 @@ class SequenceTracker(Mergeable):
             s.passed += 1
         s.streak, s.candidate = s.streak + 1, best
         s.alike += float(self.closeness[best])
+        alike = s.alike / s.streak
+        self.seen = seen._replace(streak=s.streak, passed=s.passed, alike=alike)
         enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
-        return enough and s.alike <= c.alike * s.streak
+        return enough and alike <= c.alike
 
     def _jumped(self, compared: np.ndarray, around: _Around, current: int) -> int:
         """Return where the robot is after a sudden change of view, or that there is no sign of one.

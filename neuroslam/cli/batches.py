@@ -163,7 +163,7 @@ def fleet_command(
         )
     for part in report.apart:
         say(f"stays apart: sessions {', '.join(map(str, part['sessions']))}")
-    say_notes(out, sorted(f"sessions/{path.name}" for path in (out / "sessions").iterdir()))
+    say_notes(out, sorted(f"sessions/{path.name}" for path in out.glob("sessions/*")))
     say(f"Written: {out}")
     for row in report.failed:
         complain("fleet", f"session {row['session']}: {row['error']}")

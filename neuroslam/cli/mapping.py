@@ -74,7 +74,7 @@ def run_command(
     given = tuple(assignments or ())
     settings = resolve_config(preset, config, given, base)
     if preset == "auto" or (preset is None and config is None and not maps):
-        settings, preset = _estimated(source, config, given, stop, settings, preset)
+        settings, preset = _estimated(source, config, given, stop, offset, settings, preset)
     with show_frames(source) as (on_start, on_step):
         summary = run(
             source,
@@ -103,6 +103,7 @@ def _estimated(
     config: Path | None,
     given: tuple[str, ...],
     stop: int | None,
+    offset: str | None,
     settings: "BrainConfig",
     preset: str | None,
 ) -> tuple["BrainConfig", str | None]:
@@ -110,10 +111,12 @@ def _estimated(
 
     Without a preset, a source that is too short, or has no pictures, keeps the settings it has.
     """
+    from neuroslam.runs.clocks import resolve_offset
     from neuroslam.runs.run import resolve_config
     from neuroslam.sensors import open_source
     from neuroslam.tuning.auto import estimate, has_pictures
 
+    source, _ = resolve_offset(source, offset, settings)
     opened = open_source(source, settings.frame_rate_hz, settings.view.grey)
     plain = settings.view.features == "grey" and not settings.view.orientations
     if preset is None and not (plain and has_pictures(opened)):

@@ -41,10 +41,15 @@ class Mapped(Protocol):
         ...
 
 
+SAME_CONFIG = "run the second session with --config FIRST/config.toml, the config of the first"
+"""Remedy for maps whose configs differ."""
+
+
 def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
     """Name the parameters of views and populations that differ, which prevents a merge.
 
-    The path of network weights is ignored; :func:`differing` compares the weights themselves.
+    The path of network weights is ignored; :func:`differing` compares the weights themselves. The
+    threshold is ignored where sequences of views close loops: it decides nothing there.
 
     Example:
         >>> differing_keys(BrainConfig(), BrainConfig(view={"threshold": 0.04}))
@@ -56,13 +61,16 @@ def differing_keys(one: BrainConfig, other: BrainConfig) -> list[str]:
     for population in population_classes(one):
         own = (population.kind,) if population.config_section else ()
         sections += [s for s in (*population.merge_sections, *own) if s not in sections]
+    ignored = {("view", "weights")}
+    if one.map.closure == other.map.closure == "sequence":
+        ignored.add(("view", "threshold"))
     differing = []
     for section in sections:
         first, second = (getattr(config, section).model_dump() for config in (one, other))
         differing += [
             f"{section}.{key} is {first[key]} and {second[key]}"
             for key in first
-            if first[key] != second[key] and (section, key) != ("view", "weights")
+            if first[key] != second[key] and (section, key) not in ignored
         ]
     return differing
 

@@ -11,7 +11,7 @@ from neuroslam.mapping.tables import Origins, origin_key
 from neuroslam.merging.candidates import Candidates, find_candidates
 from neuroslam.merging.consistency import check_consistency, weakness
 from neuroslam.merging.limits import elsewhere, far_off, tolerance
-from neuroslam.merging.mapped import Mapped, differing
+from neuroslam.merging.mapped import SAME_CONFIG, Mapped, differing
 from neuroslam.state.match import Match, Pairs
 from neuroslam.state.sessions import session_name
 
@@ -43,7 +43,7 @@ def find_match(loaded: Mapped, partial: Mapped) -> Found:
     """
     apart = differing(loaded, partial)
     if apart:
-        return Found(None, f"the maps have different configs: {'; '.join(apart)}")
+        return Found(None, f"the maps have different configs: {'; '.join(apart)}; {SAME_CONFIG}")
     for name, brain in (("first", loaded), ("second", partial)):
         if not brain.map.n:
             return Found(None, f"the {name} map is empty")

@@ -9,7 +9,7 @@ from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.joining import links_kept
 from neuroslam.merging.consistency import check_consistency, inconsistency
-from neuroslam.merging.mapped import Mapped, differing
+from neuroslam.merging.mapped import SAME_CONFIG, Mapped, differing
 from neuroslam.merging.report import MergeReport
 from neuroslam.merging.states import merge_states, part_of
 from neuroslam.state.join import Join
@@ -56,7 +56,7 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     )  # fmt: skip
     apart = differing(loaded, partial)
     if apart:
-        report.reason = f"the maps have different configs: {'; '.join(apart)}"
+        report.reason = f"the maps have different configs: {'; '.join(apart)}; {SAME_CONFIG}"
         return Merged(None, None, report)
     one, other = (
         {n: value.cpu() for n, value in brain.state_dict().items() if not n.startswith("stored.")}

@@ -168,7 +168,8 @@ class RowWriter:
     @classmethod
     @contextlib.contextmanager
     def create(cls, folder: Path) -> Iterator["RowWriter"]:
-        """Start the files of a new run."""
+        """Start the files of a new run, in a folder that is made if it is missing."""
+        folder.mkdir(parents=True, exist_ok=True)
         with (folder / "frames.csv").open("wb") as frames, (folder / "trace.f64").open("wb") as t:
             writer = cls(folder, frames, t)
             writer._append("frames.csv", (FRAME_COLUMNS + "\n").encode())

@@ -129,14 +129,14 @@ def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
     if len(brain.sessions.sessions) > 1:
         named = ", ".join(shortened(source or "unknown source") for source in sources)
         title = f"{len(brain.sessions.sessions)} sessions on one map: {named}"
-    title = textwrap.fill(title, _TITLE_WIDTH, max_lines=3, placeholder=" …")
+    title = textwrap.fill(plain_text(title), _TITLE_WIDTH, max_lines=3, placeholder=" …")
     apart = n - int(on_map.sum())
     if brain.stored and apart:
         title += f"\n{apart:,} of {counted(n, 'frame')} are on maps that were not joined"
     elif brain.stored:
         stored = counted(len(brain.stored), "stored map")
         title += f"\n{stored} {'was' if len(brain.stored) == 1 else 'were'} not joined"
-    return plain_text(title)
+    return title
 
 
 def _session_names(brain: NavigationBrain) -> list[str]:

@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from torch import nn
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint
+from neuroslam.brain.tracker import Seen
+from neuroslam.config.sequence import SequenceConfig
 from neuroslam.errors import BadFrame, RunError, counted
 from neuroslam.figures.style import STYLE, as_rgb, new_figure, plain_text, save, write_title
 from neuroslam.geometry import TWO_PI
@@ -245,6 +247,8 @@ def _checks(
             "the smallest",
         ),
     ]
+    if brain.tracker is not None:
+        return [*found[:2], *_checks_of_tracker(brain.tracker.seen, brain.config.sequence)]
     if brain.leader.kind == "pose":
         apart = float(np.sqrt(square)) if experience != NO_EXPERIENCE else None
         found.append(
@@ -265,6 +269,27 @@ def _checks(
             )
         )
     return found
+
+
+def _checks_of_tracker(seen: Seen, limits: SequenceConfig) -> list[Check]:
+    """List the checks of a loop closure by a sequence of views, as the tracker made them."""
+    above, least = "standard deviations, above", "at least"
+    lead = seen.evidence - seen.rival
+    rows: list[tuple[str, float, float, bool, str]] = [
+        ("experiences compared", seen.compared, limits.min_experiences,
+         seen.compared >= limits.min_experiences, least),
+        (f"evidence for experience {seen.candidate}", seen.evidence, limits.believe,
+         seen.evidence > limits.believe, above),
+        ("its lead over any other part of the map", lead, limits.margin,
+         lead > limits.margin, above),
+        ("frames in a row that agree", seen.streak, limits.confirm_frames,
+         seen.streak >= limits.confirm_frames, least),
+        ("experiences passed meanwhile", seen.passed, limits.confirm_experiences,
+         seen.passed >= limits.confirm_experiences, least),
+        ("match error, as a share of the usual one", seen.alike, limits.alike,
+         seen.alike <= limits.alike, "at most"),
+    ]  # fmt: skip
+    return [Check(name, float(value), float(limit), *rest) for name, value, limit, *rest in rows]
 
 
 def _verdict(checks: list[Check], result: StepResult) -> str:

@@ -11,6 +11,7 @@ from neuroslam.brain import NavigationBrain, load_brain, save_brain
 from neuroslam.brain.tracker import Mode
 from neuroslam.config import BrainConfig
 from neuroslam.runs.run import resolve_config
+from neuroslam.runs.why import why
 from neuroslam.sensors import open_source
 from neuroslam.types import Frame, Velocity
 
@@ -223,3 +224,17 @@ def test_two_real_laps_close(shared):
     off = abs((phase[899] - phase[made[result.experience]] + 0.5) % 1 - 0.5)
     assert robot.tracker.tracks
     assert off < 0.1
+
+
+def test_why_names_the_checks_of_the_sequence(tmp_path, call):
+    world, out = "world:ellipse?width=128&height=96&frames_per_lap=200&laps=1.4", tmp_path / "run"
+    done = call("run", world, "--preset", "auto", "--no-tensorboard", "-o", out)
+    assert done.code == 0
+    rows = csv.DictReader((out / "frames.csv").read_text().splitlines())
+    closed = next(r for r in rows if int(r["frame"]) > 190 and r["action"] == "link")
+    found = why(out, int(closed["frame"]))
+    assert found.closed
+    assert [check.passed for check in found.checks] == [True] * 8
+    before = why(out, 150)
+    assert not before.closed
+    assert before.verdict.startswith("No loop: stopped by 'evidence for experience")

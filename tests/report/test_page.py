@@ -18,8 +18,9 @@ from neuroslam.report import write_report
 from neuroslam.runs.files import RowWriter, RunPlan
 from neuroslam.runs.plan import plan
 from neuroslam.runs.reading import read_frames
-from neuroslam.runs.results import RunSummary, write_results
+from neuroslam.runs.results import RunSaver, RunSummary, write_results
 from neuroslam.runs.run import run
+from neuroslam.runs.saves import writing
 from neuroslam.types import Frame, Motion, PoseEstimate, StepResult, ViewMatch
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -116,7 +117,9 @@ def picture(page):
 
 def changed(one, other) -> int:
     """How many pixels differ, but for those that only edges of lines touch."""
-    return int((np.abs(one - other).max(-1) > 100).sum())
+    seen, then = (p[..., :3].astype(int) * p[..., 3:] // 255 for p in (one, other))  # no colour: 0
+    coverage = np.abs(one[..., 3] - other[..., 3])
+    return int((np.maximum(np.abs(seen - then).max(-1), coverage) > 100).sum())
 
 
 def test_the_arrays_arrive_as_they_were(page, runs):
@@ -341,6 +344,8 @@ def streets(out: Path, n_places: int) -> None:
     """A walk through streets: so many places, and what a run of it would have written."""
     rng, brain = np.random.default_rng(0), NavigationBrain(BrainConfig())
     brain._name_session(Frame(0, 0.0), {})
+    brain.view.learn(np.zeros((10, 60)))  # each experience has this view
+    brain.leader.update_from_view(ViewMatch(0, -1.0, 0.0, True))
     ways, corner = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)]), 20
     at, way, known, frame = np.zeros(2, int), 0, {}, 0
     side = corner * (int(np.sqrt(n_places / (3 * corner))) + 1)
@@ -360,7 +365,7 @@ def streets(out: Path, n_places: int) -> None:
             if action == "link":
                 brain.map.link(known[key])
             else:
-                known[key] = brain.map.create(-1, cells, frame)
+                known[key] = brain.map.create(0, cells, frame)
             brain.clock.frame, brain.clock.time_s = frame, 0.5 * frame
             brain.clock.frames_seen += 1
             result = StepResult(
@@ -369,7 +374,8 @@ def streets(out: Path, n_places: int) -> None:
             )  # fmt: skip
             output.write(result, Frame(frame, 0.5 * frame), brain)
             frame += 1
-    write_results(brain, RunPlan("streets"), out, RunSummary())
+    with writing(out) as folder:
+        write_results(brain, RunPlan("streets"), RunSaver(folder, out), RunSummary())
 
 
 def test_a_map_of_five_thousand_places_is_moved_as_a_bitmap(show, tmp_path):

@@ -75,9 +75,21 @@ def runs(tmp_path_factory):
         "time_s,v_m_s,w_rad_s\n" + "".join(f"{0.1 * i},0.5,0.2\n" for i in range(40))
     )
     for name, *arguments in (
-        ("whole", WORLD),
-        ("a", WORLD, "--stop", "70", QUICK),
-        ("b", WORLD, "--start", "40", "--stop", "100", QUICK, "--set", "map.loops=5"),
+        ("whole", WORLD, "--preset", "ratslam"),
+        ("a", WORLD, "--preset", "ratslam", "--stop", "70", QUICK),
+        (
+            "b",
+            WORLD,
+            "--preset",
+            "ratslam",
+            "--start",
+            "40",
+            "--stop",
+            "100",
+            QUICK,
+            "--set",
+            "map.loops=5",
+        ),
         ("rat", "arena:square?minutes=1&noise=1", "--preset", "slrb"),
         ("blind", str(folder / "motion.csv"), QUICK),
     ):

@@ -180,7 +180,9 @@ def test_a_killed_run_is_drawn_and_evaluated_as_it_was_saved_and_goes_on(copy, t
 
 def test_a_run_that_saves_while_it_drives_and_is_killed_goes_on_to_the_same_files(tmp_path, says):
     out = tmp_path / "run"
-    killed(out, ["run", WORLD, "-o", out, "--save-every", "0.05"], rows=200)
+    (tmp_path / "plain.toml").write_text("")
+    plain = ("--config", tmp_path / "plain.toml")
+    killed(out, ["run", WORLD, "-o", out, "--save-every", "0.05", *plain], rows=200)
     told = json.loads((out / "metrics.json").read_text())
     assert told["interrupted"]
     assert told["frames"] > 0

@@ -36,6 +36,12 @@ def done(tmp_path_factory) -> tuple[Path, FleetReport]:
     return out, fleet([*SOURCES, ELSEWHERE], out)
 
 
+def overlapping():
+    """Two of the drives, longer: they share a quarter of the ring, which turns by 90 degrees."""
+    longer = (SOURCES[i].replace("laps=0.4", "laps=0.5") for i in (0, 2))
+    return [f"{source}&frames_per_lap=200" for source in longer]
+
+
 # --- the tree -----------------------------------------------------------------------------------
 
 
@@ -130,7 +136,7 @@ def test_the_legend_names_every_source_and_marks_those_without_an_experience():
 
 
 def test_a_fleet_on_one_map_is_exit_0_and_one_that_is_not_3(tmp_path, call):
-    given = [f"{source}&frames_per_lap=200" for source in (SOURCES[0], SOURCES[2])]
+    given = overlapping()
     joined = call("fleet", *given, "-o", tmp_path / "one", "--set", "view.threshold=0.06")
     assert (joined.code, joined.err) == (0, "")
     assert "one map of sessions 1, 2: " in joined.out
@@ -149,7 +155,7 @@ def test_a_fleet_on_one_map_is_exit_0_and_one_that_is_not_3(tmp_path, call):
 
 def test_a_failed_session_is_reported_in_one_line_and_stops_no_other(tmp_path, call):
     out = tmp_path / "out"
-    given = [f"{source}&frames_per_lap=200" for source in (SOURCES[0], SOURCES[2])]
+    given = overlapping()
     done = call("fleet", given[0], tmp_path / "nowhere.avi", given[1], "-o", out,
                 "--set", "view.threshold=0.06")  # fmt: skip
     assert done.code == 2

@@ -55,7 +55,8 @@ def runs(tmp_path_factory):
         ("elsewhere", OTHER, "--stop", "120"),
         ("other", WORLD, "--start", "100", "--stop", "200", "--set", "view.threshold=0.04"),
     ):
-        assert main(["run", *arguments, "-o", str(folder / name), QUICK]) == 0
+        given = [*arguments, "--preset", "ratslam", "-o", str(folder / name), QUICK]
+        assert main(["run", *given]) == 0
     return folder
 
 
@@ -156,7 +157,8 @@ def test_the_frames_of_a_merge_are_those_of_the_second_session(runs, merged):
 
 
 def test_two_merged_drives_have_the_places_of_one_long_drive(merged, tmp_path):
-    assert main(["run", WORLD, "--stop", "300", "-o", str(tmp_path / "one"), QUICK]) == 0
+    given = ("--preset", "ratslam", "--stop", "300", "-o", str(tmp_path / "one"), QUICK)
+    assert main(["run", WORLD, *given]) == 0
     one = load_brain(tmp_path / "one" / "brain.safetensors")
     brain = load_brain(merged / "brain.safetensors")
     assert abs(brain.map.n - one.map.n) <= 1  # where the second session began is a place too
@@ -314,7 +316,7 @@ def chain(runs, tmp_path_factory):
     """A drive that meets ``b`` and not ``a``."""
     folder = tmp_path_factory.mktemp("chain")
     given = ("--start", "230", "--stop", "380", "-o", str(folder / "c"), QUICK)
-    assert main(["run", WORLD, *given]) == 0
+    assert main(["run", WORLD, "--preset", "ratslam", *given]) == 0
     return folder / "c"
 
 
@@ -437,6 +439,7 @@ import os, signal, sys, time
 import torch
 torch.set_num_threads(1)
 from neuroslam.brain import load_brain
+from neuroslam.runs.files import brain_file
 from neuroslam.runs.merge import merge_runs
 
 a, b, out = sys.argv[1:]
@@ -453,7 +456,7 @@ for k in range(20):
     time.sleep(one * (0.05 + 1.2 * k / 20))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    brain = load_brain(out + "/brain.safetensors")
+    brain = load_brain(brain_file(out))
     print(*(session.name for session in brain.sessions.sessions), flush=True)
 """
 

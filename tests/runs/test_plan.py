@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
-from neuroslam.errors import RunError
+from neuroslam.errors import CheckpointError
 from neuroslam.geometry import rotate_points
 from neuroslam.runs.evaluate import compare_maps
 from neuroslam.runs.plan import plan
@@ -72,14 +72,14 @@ def test_wrong_goals_are_refused_in_one_line(folder, tmp_path, mistake):
     assert "has no experiences" in mistake("plan", tmp_path / "empty.safetensors", 3)
 
 
-def test_no_path_leads_to_a_part_of_the_map_without_links(folder, tmp_path):
+def test_a_map_in_two_parts_is_refused(folder, tmp_path):
     brain = load_brain(folder / "brain.safetensors")
     apart = brain.map.n
     brain.map.state.current = -1
     brain.map.create(0, brain.leader.estimate, frame=brain.clock.frame)
     brain.map.relocalise(0)
     save_brain(brain, tmp_path / "brain.safetensors")
-    with pytest.raises(RunError, match=f"no path to {apart}: no links lead from experience 0"):
+    with pytest.raises(CheckpointError, match="the map is not connected: 2 parts"):
         plan(tmp_path / "brain.safetensors", str(apart))
 
 

@@ -234,6 +234,8 @@ def test_a_run_goes_on_in_a_new_process_after_one_was_killed(whole, cut_copy):
 def test_ctrl_c_saves_and_the_run_goes_on_as_if_it_had_not_been(tmp_path):
     world, out = WORLD.replace("laps=1.5", "laps=500"), tmp_path / "run"
     command = [sys.executable, "-m", "neuroslam.cli", "run", world, "-o", out, "--no-tensorboard"]
+    (tmp_path / "plain.toml").write_text("")
+    command += ["--config", tmp_path / "plain.toml"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         while process.poll() is None:
             if (out / "frames.csv").exists() and (out / "frames.csv").stat().st_size > 4096:

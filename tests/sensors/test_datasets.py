@@ -348,7 +348,7 @@ def test_a_live_camera_is_refused_where_frames_are_read_twice(monkeypatch, tmp_p
     small = ["--set", "view.template_width=16", "--set", "odometry.max_shift_px=8"]
     out = tmp_path / "out"
     assert main(["run", "camera:0", "-o", str(out), "--stop", "5", "--no-tensorboard", *small]) == 0
-    page = write_report(out).read_text()
+    page = write_report(out, source=True).read_text()
     assert "a live source cannot be read again" in page
     with pytest.raises(RunError, match="camera:0: is live; tuning reads its source several times"):
         tune("camera:0", tmp_path / "tuned")
