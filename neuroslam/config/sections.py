@@ -407,6 +407,13 @@ class MapConfig(Section):
         description="what closes a loop; view: a single view and the pose cells, as in RatSLAM; "
         "sequence: views of several frames along the links of the map, see [sequence]",
     )
+    link_gain: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="sequence: weight of a new measurement of a link that the robot drives again; "
+        "larger: forgets earlier measurements sooner; 0: the first one stays",
+    )
     sigma_m: float = Field(
         default=0.1,
         gt=0,

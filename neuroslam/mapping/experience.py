@@ -124,8 +124,33 @@ class ExperienceMap(ExperienceGraph):
         if tracking.kind == "at" and not self._linked(self.current, there):
             self.relocalise(there, view.relative_heading_rad)  # it has passed more than one link
             return "link"
+        if tracking.kind == "at":
+            self._measure_again(there, view.relative_heading_rad)
         self.link(there, view.relative_heading_rad)
         return "link"
+
+    def _measure_again(self, target: int, relative_heading_rad: float) -> None:
+        """Average the link from the current experience with what odometry measured this time.
+
+        A path that is driven again makes no experience, so its links have to improve instead.
+        """
+        s, gain = self.state, self.config.link_gain
+        source, targets = (self.links_table.array(name) for name in ("source", "target"))
+        rows = np.flatnonzero((source == s.current) & (targets == target))
+        if not len(rows) or not gain:
+            return
+        link, heading = int(rows[0]), self.experiences.array("pose")[s.current, 2].item()
+        length, direction, facing = (
+            self.links_table.array(name) for name in ("distance_m", "heading_rad", "facing_rad")
+        )
+        ahead, left = rotate(s.dx_m, s.dy_m, -heading)
+        x = (1.0 - gain) * length[link] * math.cos(direction[link]) + gain * ahead
+        y = (1.0 - gain) * length[link] * math.sin(direction[link]) + gain * left
+        turned = wrap_angle(s.facing_rad - relative_heading_rad - heading - facing[link])
+        length[link], direction[link] = math.hypot(x, y), math.atan2(y, x)
+        facing[link] = wrap_angle(facing[link] + gain * turned)
+        self._relaxation = None
+        s.at_rest = 0
 
     def _undo(self, revoked: Revoked) -> None:
         """Drop the link of a loop closure, and put the robot where odometry alone takes it."""
