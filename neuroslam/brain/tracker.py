@@ -95,8 +95,6 @@ class _State(Scalars):
         way_m: Path length since the robot was localised last.
         localised: 1 once it has been, else 0.
         since_sudden: Frames since the view changed much between two frames.
-        twin: Experience of another path that may show the same place.
-        twin_frames: Frames in a row that agree on it.
         alike: Match error with the candidates, as a share of the usual one, summed over the streak.
         origin: Experience at which a loop closure that is not proved yet begins, or none.
         joined: Experience at which it ends.
@@ -119,8 +117,6 @@ class _State(Scalars):
     way_m: float
     localised: int
     since_sudden: int
-    twin: int
-    twin_frames: int
     alike: float
     origin: int
     joined: int
@@ -162,7 +158,6 @@ class SequenceTracker(Mergeable):
             mode=Mode.EXPLORES, frames=0, doubts=0, streak=0,
             candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0, bad=0,
             way_m=0.0, localised=0, since_sudden=0,
-            twin=NO_EXPERIENCE, twin_frames=0,
             alike=0.0, origin=NO_EXPERIENCE, joined=NO_EXPERIENCE, proved=0,
             dx_m=0.0, dy_m=0.0, turn_rad=0.0,
             jumped=NO_EXPERIENCE, jump_frames=0,
@@ -191,7 +186,7 @@ class SequenceTracker(Mergeable):
             yield f"tracker.evidence: {rows} rows for {n_experiences} experiences"
         if int(state["state.mode"]) not in set(Mode):
             yield f"tracker.state.mode: is {state['state.mode']}, expected 0 to {max(Mode)}"
-        for name in ("candidate", "began", "twin", "jumped", "origin", "joined"):
+        for name in ("candidate", "began", "jumped", "origin", "joined"):
             if not NO_EXPERIENCE <= int(state[f"state.{name}"]) < n_experiences:
                 yield f"tracker.state.{name}: no experience {state[f'state.{name}']}"
 
@@ -300,8 +295,6 @@ class SequenceTracker(Mergeable):
         jump = self._jumped(compared, around, current)
         if jump != NO_EXPERIENCE:
             return self._correct(jump, elsewhere[best], costs[here], map_)
-        if self._is_same_place(best, elsewhere[best], costs[here], around, map_):
-            return self._go("link", best, elsewhere[best], costs[here])
         if s.bad >= c.lost_frames:
             s.mode, s.bad = Mode.EXPLORES, 0
             left = Tracking("leave", current, -costs[here], -elsewhere[best])
@@ -395,25 +388,6 @@ class SequenceTracker(Mergeable):
         s.origin = s.joined = NO_EXPERIENCE
         return revoked
 
-    def _is_same_place(
-        self, best: int, cost: float, present: float, around: _Around, map_: ExperienceMap
-    ) -> bool:
-        """Return whether two paths of the map, close to each other, have shown one place for long.
-
-        The second was made while the robot was not localised on the first.
-        """
-        s, c = self.state, self.config
-        alike = cost < -c.believe and cost < present + c.margin
-        if not alike or not _side_by_side(best, map_):
-            s.twin_frames, s.twin = 0, NO_EXPERIENCE
-            return False
-        follows = s.twin != NO_EXPERIENCE and around(s.twin, 1, _AHEAD)[best]
-        s.twin_frames, s.twin = (s.twin_frames + 1 if follows else 0), best
-        if s.twin_frames < c.confirm_frames:
-            return False
-        s.twin_frames, s.twin = 0, NO_EXPERIENCE
-        return True
-
     def _closing(self, best: int, map_: ExperienceMap) -> Literal["link", "set"]:
         """Return whether the robot can have driven to an experience since it was localised last."""
         pose = map_.pose
@@ -443,12 +417,6 @@ class SequenceTracker(Mergeable):
         s = self.state
         self.evidence.array("cost")[:] = 0.0
         s.streak, s.candidate, s.bad = 0, NO_EXPERIENCE, 0
-
-
-def _side_by_side(experience: int, map_: ExperienceMap) -> bool:
-    """Return whether an experience is a few links, as a crow flies, from the current one."""
-    apart = map_.pose_table[experience, :2] - map_.pose_table[map_.current, :2]
-    return bool(np.hypot(*apart) < 2 * _APART * _link_length(map_))
 
 
 def _link_length(map_: ExperienceMap) -> float:
