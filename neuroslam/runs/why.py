@@ -289,7 +289,10 @@ def _checks_of_tracker(seen: Seen, limits: SequenceConfig) -> list[Check]:
         ("match error, as a share of the usual one", seen.alike, limits.alike,
          seen.alike <= limits.alike, "at most"),
     ]  # fmt: skip
-    return [Check(name, float(value), float(limit), *rest) for name, value, limit, *rest in rows]
+    return [
+        Check(name, float(value), float(limit), passed, unit)
+        for name, value, limit, passed, unit in rows
+    ]
 
 
 def _verdict(checks: list[Check], result: StepResult) -> str:
