@@ -141,7 +141,7 @@ def run_folder(folder: Path) -> list[Target]:
     out = sound_run(folder / "run")
     note_base()
     files = {str(f.relative_to(out)): f.read_bytes() for f in out.rglob("*") if f.is_file()}
-    files.pop("manifest.json", None)  # whoever alters a folder can remove its digests
+    files.pop("manifest.json", None)  # an attacker can remove its digests
     texts = (
         "config.toml",
         "metrics.json",

@@ -30,6 +30,15 @@ def shared() -> Path:
 
 
 @pytest.fixture
+def cases(shared) -> Path:
+    """Inputs that went wrong, kept beside the checkout."""
+    folder = shared / "cases"
+    if not folder.is_dir():
+        pytest.skip("no ../shared/cases beside the checkout")
+    return folder
+
+
+@pytest.fixture
 def forked(monkeypatch):
     """Fork the processes of ``--jobs`` from one that has loaded torch, which each else loads anew.
 

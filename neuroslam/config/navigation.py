@@ -116,8 +116,8 @@ class GridCellConfig(Section):
         default=24,
         ge=1,
         le=MOST_CELLS,
-        description="cells of a module; larger: positions are told apart better, each step takes "
-        "longer",
+        description="cells of a module; larger: positions are distinguished better, each step "
+        "takes longer",
     )
     hebbian_rate: float = Field(
         default=0.1,

@@ -106,14 +106,15 @@ class ViewConfig(Section):
         default=60,
         ge=2,
         le=MOST_PX,
-        description="width of a template in px; larger: more detail, similar scenes are told apart",
+        description="width of a template in px; larger: more detail, similar scenes are "
+        "distinguished",
     )
     template_height: int = Field(
         default=10,
         ge=1,
         le=MOST_PX,
-        description="height of a template in px; larger: more detail, similar scenes are told "
-        "apart",
+        description="height of a template in px; larger: more detail, similar scenes are "
+        "distinguished",
     )
     threshold: float = Field(
         default=0.05,

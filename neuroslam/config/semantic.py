@@ -474,7 +474,7 @@ class SemanticConfig(SSPSLAMConfig):
         default=256,
         ge=16,
         le=MOST_FREQUENCIES,
-        description="length of a landmark's pointer; larger: more landmarks are told apart",
+        description="length of a landmark's pointer; larger: more landmarks are distinguished",
     )
     same_m: float = Field(
         default=1.0,

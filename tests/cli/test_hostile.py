@@ -34,14 +34,6 @@ QUICK = "--no-tensorboard"
 ESCAPE = "\x1b]0;pwned\x07\x1b[2J"
 
 
-@pytest.fixture
-def cases(shared):
-    folder = shared / "cases"
-    if not folder.is_dir():
-        pytest.skip("no ../shared/cases beside the checkout")
-    return folder
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "run"

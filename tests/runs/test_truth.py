@@ -111,14 +111,6 @@ def as_tum(times_s, poses):
     ]
 
 
-@pytest.fixture
-def cases(shared):
-    folder = shared / "cases"
-    if not folder.is_dir():
-        pytest.skip("no ../shared/cases beside the checkout")
-    return folder
-
-
 def test_the_given_truth_that_begins_late_counts_for_50_of_60_frames(cases, tmp_path, call):
     done = call("run", cases / "truth_begins_late", "-o", tmp_path / "m", "--no-tensorboard")
     assert done.code == 0

@@ -21,14 +21,6 @@ MB = 2**20
 
 
 @pytest.fixture
-def cases(shared):
-    folder = shared / "cases"
-    if not folder.is_dir():
-        pytest.skip("no ../shared/cases beside the checkout")
-    return folder
-
-
-@pytest.fixture
 def budget(monkeypatch):
     return lambda text: monkeypatch.setenv(MAX_MEMORY, text)
 

@@ -24,14 +24,6 @@ from neuroslam.sensors.times import (
 UNIX_S = 1_700_000_000.0
 
 
-@pytest.fixture
-def cases(shared):
-    folder = shared / "cases"
-    if not folder.is_dir():
-        pytest.skip("no ../shared/cases beside the checkout")
-    return folder
-
-
 def table(path, header, times, tail="1.0,0.1"):
     path.write_text("\n".join([header, *(f"{time},{tail}" for time in times)]) + "\n")
     return path
