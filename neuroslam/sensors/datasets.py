@@ -1,14 +1,18 @@
-r"""Folders with the layout of TUM RGB-D, KITTI odometry, EuRoC, or a tub of donkeycar.
+r"""Folders with the layout of TUM RGB-D, KITTI, EuRoC, TUM-VI, or a tub of donkeycar.
 
 Each has images with times, and may have ground-truth poses in three dimensions. The truth of a
 frame is the pose projected onto the ground plane: position, and heading of the optical axis.
 
 ============  =======================================================  ======================
 TUM RGB-D     ``rgb.txt``, ``rgb/``; ``groundtruth.txt``               z is up
+KITTI raw     ``image_02/data/``, ``timestamps.txt``;                  Mercator plane, x east,
+              ``oxts/data/``, ``oxts/timestamps.txt``                  m from the first pose
 KITTI         ``image_0/`` or ``image_2/``, ``times.txt``;             y is down: ground x is
               ``poses.txt`` or ``../../poses/NN.txt``                  z, ground y is -x
 EuRoC         ``mav0/cam0/data.csv``, ``data/``, ``sensor.yaml``;      z is up
               ``mav0/state_groundtruth_estimate0/data.csv``
+TUM-VI        as EuRoC; ``mav0/mocap0/data.csv``,                      z is up
+              ``dso/camchain.yaml``
 donkeycar     ``manifest.json``, ``catalog_N.catalog``, ``images/``    no truth
 ============  =======================================================  ======================
 """
@@ -30,7 +34,7 @@ from neuroslam.sensors.images import (
     parse_times,
     read_text,
 )
-from neuroslam.sensors.times import in_seconds, unit_note
+from neuroslam.sensors.times import in_seconds, parse_time, unit_note
 from neuroslam.sensors.tub import is_tub, open_tub
 from neuroslam.types import GreyRule
 
@@ -44,6 +48,9 @@ _ROUNDING_S = 1e-6
 """Unix times in s differ by less than this through rounding."""
 
 _KITTI_CAMERAS = ("image_2", "image_0", "image_3", "image_1")
+_RAW_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
+_EARTH_M = 6378137.0  # radius of the Earth
+_TRUTHS = ("state_groundtruth_estimate0", "mocap0")  # of EuRoC and of TUM-VI
 
 
 def open_dataset(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource | None:
@@ -61,6 +68,8 @@ def open_dataset(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> I
         return open_tub(path, frame_rate_hz, grey)
     if any((path / camera).is_dir() for camera in _KITTI_CAMERAS):
         return open_kitti(path, frame_rate_hz, grey)
+    if any((path / camera / "data").is_dir() for camera in _RAW_CAMERAS):
+        return open_kitti_raw(path, frame_rate_hz, grey)
     return None
 
 
@@ -132,8 +141,59 @@ def open_kitti(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Ima
     )
 
 
+def open_kitti_raw(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
+    r"""Open a drive of the raw KITTI recordings; the truth is that of its GPS and IMU (OXTS).
+
+    Latitude :math:`\varphi` and longitude :math:`\lambda` are projected as in the development kit,
+    with the scale :math:`s = \cos\varphi_0` of the first pose and the Earth's radius :math:`R`:
+
+    .. math:: x = s R \lambda, \qquad y = s R \ln \tan(\pi/4 + \varphi/2)
+
+    Raises:
+        SourceError: If a file is missing or damaged.
+    """
+    folder = next(path / camera for camera in _RAW_CAMERAS if (path / camera / "data").is_dir())
+    names = sorted(f.name for f in (folder / "data").iterdir() if is_image_name(f.name))
+    if not names:
+        raise SourceError(f"{folder / 'data'}: contains no images; expected 0000000000.png")
+    notes: list[str] = []
+    times, truth = _raw_times(folder / "timestamps.txt"), None
+    files = sorted((path / "oxts" / "data").glob("*.txt"))
+    known = _raw_times(path / "oxts" / "timestamps.txt")
+    if files and times is not None and known is not None and len(known) == len(files):
+        rows = np.array([_table(file, 6, notes)[0] for file in files])
+        lat, lon = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+        scale_m = np.cos(lat[0]) * _EARTH_M
+        x, y = scale_m * lon, scale_m * np.log(np.tan(np.pi / 4.0 + lat / 2.0))
+        begin_s = times[0]
+        truth = at_times(
+            known - begin_s, np.column_stack([x - x[0], y - y[0], rows[:, 5]]), times - begin_s
+        )
+        notes.append(
+            f"{path / 'oxts'}: GPS and IMU are the truth; the motion is that of the images"
+        )
+    if times is not None:
+        times = times - times[0]
+    images = [ImageFile(name, folder / "data" / name) for name in names]
+    return ImageSource(
+        str(path), images, times, frame_rate_hz, truth=truth, grey=grey, notes=tuple(notes)
+    )
+
+
+def _raw_times(path: Path) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    lines = read_text(path).split("\n")
+    times = [np.nan if (t := parse_time(line)) is None else t for line in lines if line.strip()]
+    if not times or np.isnan(times).all():
+        raise SourceError(
+            f"{path}: has no times; expected lines like 2011-09-26 13:02:25.594360375"
+        )
+    return np.array(times)
+
+
 def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
-    """Open the left camera of a ``mav0`` folder of the EuRoC MAV dataset.
+    """Open the left camera of a ``mav0`` folder of the EuRoC MAV or the TUM-VI dataset.
 
     Raises:
         SourceError: If a file is missing or damaged.
@@ -152,10 +212,11 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
         raise SourceError(f"{camera / 'data.csv'}: lists no images; expected one per line")
     images = [ImageFile(name, camera / "data" / name) for name in names]
     truth, notes = None, []
-    truth_file = mav / "state_groundtruth_estimate0" / "data.csv"
-    if truth_file.is_file():
+    truth_file = next((f for t in _TRUTHS if (f := mav / t / "data.csv").is_file()), None)
+    if truth_file is not None:
         rows = _table(truth_file, 8, notes, ",")
-        axis = _optical_axis(camera / "sensor.yaml")
+        chain = mav.parent / "dso" / "camchain.yaml"
+        axis = _axis_in_chain(chain) if chain.is_file() else _optical_axis(camera / "sensor.yaml")
         forward = rotate(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
         truth = at_times(rows[:, 0] / 1e9, poses, times)
@@ -287,3 +348,17 @@ def _optical_axis(sensor: Path) -> np.ndarray:
     except ValueError:
         raise SourceError(f"{sensor}: has no T_BS; expected a matrix of 16 numbers") from None
     return matrix[:3, 2]
+
+
+def _axis_in_chain(chain: Path) -> np.ndarray:
+    """Direction of the optical axis of the first camera in the frame of the IMU.
+
+    It is the third row of ``T_cam_imu`` of Kalibr's ``camchain.yaml``.
+    """
+    data = re.search(r"T_cam_imu:\s*((?:-\s*\[[^\]]*\]\s*){4})", read_text(chain))
+    words = [] if data is None else re.findall(r"[-+\d.eE]+(?=\s*[,\]])", data[1])
+    try:
+        matrix = np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise SourceError(f"{chain}: has no T_cam_imu; expected a matrix of 16 numbers") from None
+    return matrix[2, :3]

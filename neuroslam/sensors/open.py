@@ -9,6 +9,7 @@ from pathlib import Path
 
 from neuroslam.errors import SourceError
 from neuroslam.sensors.camera import CameraSource
+from neuroslam.sensors.carmen import is_carmen, open_carmen
 from neuroslam.sensors.datasets import open_dataset
 from neuroslam.sensors.images import (
     is_image_name,
@@ -17,7 +18,14 @@ from neuroslam.sensors.images import (
     open_tar,
     read_text,
 )
+from neuroslam.sensors.mrclam import is_mrclam, open_mrclam
 from neuroslam.sensors.rosbag import is_bag, open_bag
+from neuroslam.sensors.sightings import (
+    SightingsSource,
+    WithSightings,
+    is_sightings,
+    parse_sightings,
+)
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import TrackSource, parse_motion, read_positions, read_track
@@ -29,7 +37,8 @@ DEFAULT_FRAME_RATE_HZ = 20.0
 _TAR_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _KINDS = (
     "a video, a folder or tar of images, an image list or motion CSV, an .npz or .npy track, "
-    "a TUM, KITTI or EuRoC folder, a donkeycar tub, a ROS bag, camera:0, world:NAME, arena:NAME, "
+    "a TUM, KITTI, EuRoC or MRCLAM folder, a donkeycar tub, a CARMEN log, a ROS bag, camera:0, "
+    "world:NAME, arena:NAME, a CSV of landmark sightings beside motion, "
     "or a camera and motion as drive.avi+motion.csv"
 )
 _OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
@@ -49,7 +58,9 @@ def open_source(
     ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
     ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
     ``rat.npz`` with an arena in it     positions and walls (:mod:`neuroslam.worlds.rodent`)
-    TUM, KITTI or EuRoC folder          images and truth (:mod:`neuroslam.sensors.datasets`)
+    TUM, KITTI, EuRoC, TUM-VI folder    images and truth (:mod:`neuroslam.sensors.datasets`)
+    ``log.clf``, ``.log``, ``.bz2``     scans of a CARMEN log (:mod:`neuroslam.sensors.carmen`)
+    MRCLAM folder, ``?robot=2``         odometry and landmarks (:mod:`neuroslam.sensors.mrclam`)
     tub of donkeycar                    images, times, controls (:mod:`neuroslam.sensors.tub`)
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
@@ -58,6 +69,7 @@ def open_source(
     ``drive.avi+motion.csv``            two sources merged by time: a camera and motion
                                         (:mod:`neuroslam.sensors.streams`); with ``?offset=S``, S
                                         seconds are added to the times of the motion
+    ``motion.csv+sightings.csv``        motion and landmarks (:mod:`neuroslam.sensors.sightings`)
     ==================================  ========================================================
 
     Args:
@@ -83,6 +95,9 @@ def open_source(
         if parts := _parts(pair):
             offset_s = _offset_s(pair, offset)
             first, second = (open_source(part, frame_rate_hz, grey) for part in parts)
+            for source, table in ((first, second), (second, first)):
+                if isinstance(table, SightingsSource):
+                    return WithSightings(source, table, offset_s)
             return Streams(first, second, offset_s)
         if isinstance(spec, str) and spec.startswith("world:"):
             from neuroslam.worlds.world import open_world  # here: worlds import this package
@@ -97,6 +112,9 @@ def open_source(
         path, topics = _bag_topics(str(spec))
         if is_bag(path) and path.exists():
             return open_bag(path, topics, grey)
+        folder, _, query = str(spec).partition("?")
+        if is_mrclam(Path(folder)):
+            return open_mrclam(Path(folder), query)
         path = Path(spec)
         if not path.exists():
             if "://" in str(spec):
@@ -184,7 +202,7 @@ def absolute_spec(spec: str) -> str:
     if spec.startswith(_PREFIXES) or ("://" in spec and not Path(spec).exists()):
         return spec
     path, topics = _bag_topics(spec)
-    if topics and is_bag(path):
+    if topics and (is_bag(path) or is_mrclam(path)):
         return str(path.resolve()) + spec.removeprefix(str(path))
     return str(Path(spec).resolve())
 
@@ -247,6 +265,8 @@ def _opener(path: Path) -> Callable[[Path, float, GreyRule], Source]:
     name = path.name.lower()
     if path.is_dir():
         return _open_folder
+    if is_carmen(path):
+        return open_carmen
     if name.endswith(VIDEO_SUFFIXES):
         return VideoSource
     if name.endswith(_TAR_SUFFIXES):
@@ -270,6 +290,8 @@ def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     for row in _first_rows(text, 10):
         if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz, grey)
+    if any(is_sightings(row) for row in _first_rows(text, 1)):
+        return parse_sightings(text, str(path))
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
 
 

@@ -16,7 +16,6 @@ from typing import Any, cast
 import numpy as np
 
 from neuroslam.errors import BadFrame, NeuroslamError, SourceError, did_you_mean
-from neuroslam.geometry import TWO_PI, wrap_angles
 from neuroslam.sensors.bag_images import grey_of
 from neuroslam.sensors.bag_odometry import OdometrySample, motion_between, odometry_sample
 from neuroslam.sensors.bag_topics import (
@@ -28,6 +27,7 @@ from neuroslam.sensors.bag_topics import (
     note_of,
     time_of,
 )
+from neuroslam.sensors.full_turn import full_turn
 from neuroslam.sensors.images import require_shape
 from neuroslam.sensors.pixels import PixelScale
 from neuroslam.sensors.source import OnBadFrame, Source
@@ -36,9 +36,6 @@ from neuroslam.sensors.tracks import time_text
 from neuroslam.types import Frame, GreyRule, Velocity
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
-N_RANGES = 360
-"""Number of bearings to which a scan is resampled, evenly over the full turn."""
-
 _MOTION = ("twist", "poses")
 
 
@@ -277,42 +274,3 @@ class BagMotion(_BagTopic):
                 f"{self.name}: frame {index}: v = {v} m/s, w = {w} rad/s; expected finite numbers"
             )
         return Frame(index, time_s, velocity=Velocity(v, w), ranges=self.ranges)
-
-
-def full_turn(
-    ranges: np.ndarray, first_rad: float, step_rad: float, min_m: float, max_m: float
-) -> np.ndarray:
-    """Resample a scan to bearings evenly over the full turn.
-
-    Args:
-        ranges: Distances in metres, ``(n,)``.
-        first_rad: Bearing of the first beam, positive to the left.
-        step_rad: Angle from beam to beam.
-        min_m: Shorter distances are invalid.
-        max_m: Longer distances are invalid.
-
-    Returns:
-        Distances at ``N_RANGES`` bearings, counter-clockwise from straight ahead: that of the beam
-        nearest in bearing; ``inf`` if no beam is within one step, or its distance is invalid.
-
-    Raises:
-        BadFrame: If there are no beams, or their bearings are not numbers.
-
-    Example:
-        >>> turn = full_turn(np.array([1.0, 2.0, 3.0]), -np.pi / 2, np.pi / 2, 0.1, 10.0)
-        >>> turn[[270, 0, 90, 180]].tolist()
-        [1.0, 2.0, 3.0, inf]
-    """
-    distances = np.asarray(ranges, np.float64)
-    if not (len(distances) and np.isfinite(first_rad) and np.isfinite(step_rad) and step_rad):
-        raise BadFrame(
-            f"scan of {len(distances)} beams from {first_rad} rad in steps of {step_rad} rad; "
-            "expected beams in steps other than 0"
-        )
-    distances = np.where((distances >= min_m) & (distances <= max_m), distances, np.inf)
-    bearings = np.arange(N_RANGES) * (TWO_PI / N_RANGES)
-    middle = first_rad + 0.5 * step_rad * (len(distances) - 1)
-    offset = wrap_angles(bearings - middle) + (middle - first_rad)
-    beam = np.rint(offset / step_rad).astype(np.int64)
-    covered = (beam >= 0) & (beam < len(distances))
-    return np.where(covered, distances[beam.clip(0, len(distances) - 1)], np.inf)

@@ -9,7 +9,7 @@ import pytest
 from neuroslam.errors import BadFrame, SourceError
 from neuroslam.sensors import open_source
 from neuroslam.sensors.bag_odometry import OdometrySample, check_odometry
-from neuroslam.sensors.rosbag import full_turn
+from neuroslam.sensors.full_turn import full_turn
 
 pytest.importorskip("rosbags", reason="needs the extra rosbag")
 

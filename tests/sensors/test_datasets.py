@@ -11,8 +11,8 @@ from neuroslam.cli import main
 from neuroslam.errors import RunError, SourceError
 from neuroslam.report import write_report
 from neuroslam.sensors import camera, open_source
+from neuroslam.sensors.full_turn import full_turn
 from neuroslam.sensors.open import absolute_spec
-from neuroslam.sensors.rosbag import full_turn
 from neuroslam.tuning import tune
 
 N = 12
