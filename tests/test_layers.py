@@ -27,6 +27,7 @@ PLAN = [line.split() for line in """
     brain
     evaluation
     figures
+    adapters
     runs report tuning experiments
     cli
 """.strip().splitlines()]  # fmt: skip

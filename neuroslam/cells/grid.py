@@ -16,6 +16,9 @@ from neuroslam.state.mergeable import Arrays, BufferModule
 _DEVELOPMENT_BATCH = 64
 _DEVELOPMENT_RANGE_M = 100.0
 _KEPT = 8
+SETTLING_STEPS = 24
+"""Steps after which the rates at rest no longer change; see :meth:`LAHNGridCells.settled`."""
+
 _developed: dict[tuple[str, torch.dtype], dict[str, Tensor]] = {}
 
 
@@ -343,6 +346,26 @@ class LAHNGridCells(BufferModule):
         if self.config.learns_online:
             with torch.no_grad():
                 self.learn(inputs.detach().reshape(-1, *inputs.shape[-2:]), self._online)
+        return rates
+
+    def settled(self, phases: Tensor) -> Tensor:
+        r"""Return the rates at rest for phases that stay; neither the state nor the weights change.
+
+        .. math:: r \leftarrow [Q x + W r - b]_+ \quad \text{from } r = 0,
+
+        :data:`SETTLING_STEPS` times. Gradients flow to the weights and to the phases.
+
+        Args:
+            phases: Cosine and sine, ``(..., n_modules, directions, 2)``.
+
+        Returns:
+            ``(..., n_modules, n_cells)``, non-negative.
+        """
+        inputs = phases.flatten(-2).to(self.bias.dtype)
+        rates = inputs.new_zeros(*inputs.shape[:-1], self.config.n_cells)
+        for _ in range(SETTLING_STEPS):
+            drive = lahn_drive(inputs, rates, self.feedforward, self.coupling)
+            rates = (drive - self.bias).clamp_min(0.0)
         return rates
 
     def rates_compiled(self, phases: np.ndarray) -> np.ndarray:

@@ -238,12 +238,39 @@ class VelocityOscillators(BufferModule):
             self._wave_arrays = waves, waves.numpy(), np.ascontiguousarray(solver.numpy())
         return self._wave_arrays[1:]
 
-    def place_at(self, position_m: Tensor) -> Tensor:
-        """Set the phases to those of a position, ``([batch,] 2)``, and return them."""
+    def phases_at(self, position_m: Tensor) -> Tensor:
+        """Return the phases at positions, ``(..., 2)``; the state does not change.
+
+        Gradients flow to the position and to ``spacing_m``.
+
+        Returns:
+            Phases as cosine and sine, ``(..., n_modules, directions, 2)``.
+
+        Example:
+            >>> oscillators = VelocityOscillators(GridCellConfig())
+            >>> oscillators.phases_at(torch.zeros(5, 2)).shape
+            torch.Size([5, 4, 6, 2])
+        """
         waves, _ = self._kept_waves()
-        start = torch.zeros_like(self.phases)
+        position = position_m.to(self.position_m)
+        start = self.phases.new_zeros(*position.shape[:-1], *self.phases.shape[-3:])
         start[..., 0] = 1.0
-        position_m = position_m.to(self.position_m)
-        self.phases = turn_phases(waves, position_m, start).detach()
-        self.position_m = position_m.detach().clone()
-        return self.phases
+        return turn_phases(waves, position, start)
+
+    def place_at(self, position_m: Tensor) -> Tensor:
+        """Set the phases to those of a position, ``([batch,] 2)``, and return them.
+
+        Gradients flow through what it returns, as those of :meth:`shift` do; the state is detached.
+
+        Example:
+            >>> oscillators = VelocityOscillators(GridCellConfig())
+            >>> phases = oscillators.place_at(torch.tensor([0.2, 0.1]))
+            >>> phases.sum().backward()
+            >>> bool((oscillators.spacing_m.grad != 0.0).all()), oscillators.phases.requires_grad
+            (True, False)
+        """
+        position = position_m.to(self.position_m).expand_as(self.position_m)
+        phases = self.phases_at(position)
+        self.phases = phases.detach().contiguous()
+        self.position_m = position.detach().clone()
+        return phases
