@@ -17,7 +17,6 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.errors import BadFrame, MapError
@@ -126,6 +125,8 @@ class Localiser:
         panoramic = self.config.view.panoramic
         self._turn_scale_m = 0.0 if panoramic else limits.place_m / limits.turn_rad
         self._points = self._coordinates(self.poses[self._own])
+        from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
         self._tree = cKDTree(self._points)
         self._odometry = VisualOdometry(self.config.odometry, self.config.view.grey)
         self._path: deque[_Seen] = deque(maxlen=FRAMES)

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from pydantic import TypeAdapter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.brain.tracker import SequenceTracker
@@ -167,6 +165,9 @@ def _bound_faults(bound: np.ndarray, config: BrainConfig) -> Iterator[str]:
 
 def _link_faults(s: dict[str, np.ndarray], n: int) -> Iterator[str]:
     links = Links(*(s[f"map.links_table.{name}"] for name in Links._fields))
+    from scipy.sparse import coo_array  # slow to import, not always needed
+    from scipy.sparse.csgraph import connected_components
+
     loops = np.flatnonzero(links.source == links.target)
     if len(loops):
         yield (

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from neuroslam.cells.boundary_vectors import squared_mismatch, wrap
@@ -110,6 +109,8 @@ def _same_places(loaded: State, partial: State, frames: Frames) -> np.ndarray:
     n, m = (int(state["place.n_cells"][0]) for state in (loaded, partial))
     ids = n + np.arange(m)
     if n and m:
+        from scipy.spatial import KDTree  # slow to import, not always needed
+
         threshold = float(loaded["place.threshold_m"])
         moved = frames.place(partial["place.centres_m"][0, :m])
         away, nearest = KDTree(loaded["place.centres_m"][0, :n].numpy()).query(moved.numpy())

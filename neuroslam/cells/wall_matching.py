@@ -1,10 +1,9 @@
 """Alignment of two maps without views by the walls that both sessions remember."""
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from neuroslam.config import BrainConfig
@@ -12,6 +11,9 @@ from neuroslam.errors import counted
 from neuroslam.geometry import TWO_PI, rotation_matrix, wrap_angle, wrap_angles
 from neuroslam.state.match import Match, Pairs
 from neuroslam.types import Pose
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 _LEAST_WALLS = 6
 _LEAST_SHARE = 0.6  # of the walls of the smaller map that must match
@@ -78,6 +80,8 @@ def align_outlines(
         reach_m: Extent of a wall segment.
         off_m: Largest distance between two walls that match.
     """
+    from scipy.spatial import KDTree  # slow to import, not always needed
+
     tree = KDTree(loaded.feet_m)
     tried: list[tuple[int, float, np.ndarray]] = []
     for turn in turns_rad:
@@ -105,7 +109,7 @@ def align_outlines(
 
 
 def _scores(
-    tree: KDTree, loaded: Outline, turned: Outline, moves: np.ndarray, reach_m: float
+    tree: "KDTree", loaded: Outline, turned: Outline, moves: np.ndarray, reach_m: float
 ) -> np.ndarray:
     """Count the walls that match after each displacement, shape ``(moves,)``."""
     scores = []
@@ -121,7 +125,7 @@ def _scores(
 
 
 def _refine(
-    tree: KDTree,
+    tree: "KDTree",
     loaded: Outline,
     partial: Outline,
     turn: float,
@@ -254,6 +258,8 @@ def _same_experiences(
     maps: tuple[np.ndarray, np.ndarray], alignment: OutlineAlignment, threshold_m: float
 ) -> Match | None:
     """Pair experiences that are nearer than the smallest distance of two place cells."""
+    from scipy.spatial import KDTree
+
     loaded, partial = maps
     moved = Outline(partial[:, :2], partial[:, 2]).moved(alignment.turn_rad, alignment.move_m)
     away, nearest = map(np.asarray, KDTree(loaded[:, :2]).query(moved.feet_m))

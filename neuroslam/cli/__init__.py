@@ -107,7 +107,9 @@ _COMMANDS: dict[str, Callable[..., int]] = {
 for _name, _command in _COMMANDS.items():
     # A position such as -1,2 is no option.
     negative = {"ignore_unknown_options": _name == "plan"}
-    app.command(_name, context_settings=negative)(with_common_options(_command))
+    app.command(_name, context_settings=negative)(
+        with_common_options(_command, heavy=_name != "presets")
+    )
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from neuroslam.cli.loading import load
 from neuroslam.errors import ConfigError
 from neuroslam.limits import MAX_MEMORY, budget_bytes
 
@@ -133,8 +134,13 @@ MaxMemory = Annotated[
 ]
 
 
-def with_common_options(command: Callable[..., int]) -> Callable[..., int]:
-    """Add ``--plugin`` and ``--max-memory`` to a command; they take effect before it runs."""
+def with_common_options(command: Callable[..., int], *, heavy: bool = True) -> Callable[..., int]:
+    """Add ``--plugin`` and ``--max-memory`` to a command; they take effect before it runs.
+
+    Args:
+        command: The command.
+        heavy: Whether it needs the library with torch, which is then loaded first.
+    """
 
     @wraps(command)
     def run(
@@ -144,6 +150,8 @@ def with_common_options(command: Callable[..., int]) -> Callable[..., int]:
         **options: object,
     ) -> int:
         with _budget(max_memory):
+            if heavy:
+                load()
             if plugin:
                 from neuroslam.config.populations import load_plugin
 

@@ -2,13 +2,15 @@
 
 import math
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy import fft, ndimage, sparse
 
 from neuroslam.errors import MapError
 from neuroslam.evaluation.ratemap import label_regions
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Unvisited = Literal["skip", "silent"]
 
@@ -194,6 +196,8 @@ def _as_maps(who: str, maps: np.ndarray) -> np.ndarray:
 
 def _correlate(maps: np.ndarray, unvisited: Unvisited) -> np.ndarray:
     """Eq. 13 for ``(N, n_y, n_x)``."""
+    from scipy import fft  # slow to import, not always needed
+
     visited = np.isfinite(maps)
     if unvisited == "silent":
         lowest = np.where(visited, maps, np.inf).min(axis=(1, 2), keepdims=True)
@@ -257,7 +261,7 @@ class _Rings(NamedTuple):
 
     bins: np.ndarray  # flat index of every bin
     starts: np.ndarray  # where each whole radius begins among them
-    turned: sparse.csr_array  # bilinear weights, (5 turns x bins, all bins)
+    turned: "csr_array"  # bilinear weights, (5 turns x bins, all bins)
 
 
 @lru_cache(maxsize=8)
@@ -266,6 +270,8 @@ def _rings(rows: int, columns: int) -> _Rings:
 
     The autocorrelogram is symmetric under a turn of 180 degrees, so its upper half is enough.
     """
+    from scipy.sparse import csr_array, vstack
+
     y, x = np.mgrid[:rows, :columns]
     y, x = y - rows // 2, x - columns // 2
     radius = np.ceil(np.hypot(x, y)).astype(np.int64)
@@ -280,11 +286,13 @@ def _rings(rows: int, columns: int) -> _Rings:
         column = np.cos(angle) * at_x - np.sin(angle) * at_y + columns // 2
         row = np.sin(angle) * at_x + np.cos(angle) * at_y + rows // 2
         turns.append(_bilinear(row, column, rows, columns))
-    return _Rings(flat, starts, sparse.csr_array(sparse.vstack(turns)))
+    return _Rings(flat, starts, csr_array(vstack(turns)))
 
 
-def _bilinear(row: np.ndarray, column: np.ndarray, rows: int, columns: int) -> sparse.csr_array:
+def _bilinear(row: np.ndarray, column: np.ndarray, rows: int, columns: int) -> "csr_array":
     """Weights of the four bins around every point, ``(points, rows x columns)``."""
+    from scipy.sparse import csr_array
+
     row, column = row.round(9), column.round(9)  # a point on a bin needs no neighbour
     low_row, low_column = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
     points, indices, weights = [], [], []
@@ -296,7 +304,7 @@ def _bilinear(row: np.ndarray, column: np.ndarray, rows: int, columns: int) -> s
             indices.append((low_row[keep] + up) * columns + low_column[keep] + right)
             weights.append(weight[keep])
     where = (np.concatenate(points), np.concatenate(indices))
-    return sparse.csr_array((np.concatenate(weights), where), shape=(len(row), rows * columns))
+    return csr_array((np.concatenate(weights), where), shape=(len(row), rows * columns))
 
 
 def _score(r: np.ndarray) -> np.ndarray:
@@ -332,6 +340,8 @@ def _score(r: np.ndarray) -> np.ndarray:
 
 def _inner_pairs(r: np.ndarray, centre_radius: float) -> np.ndarray:
     """Up to three peaks ``(x, y)`` of the upper half, in bins; the other three lie opposite."""
+    from scipy import ndimage
+
     rows, columns = r.shape
     filled = np.where(np.isfinite(r), r, -np.inf)
     # A peak is the highest within half the radius of a field, so ripples within a field are none.

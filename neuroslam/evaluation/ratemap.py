@@ -3,7 +3,6 @@
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy import ndimage, sparse
 
 from neuroslam.errors import MapError
 
@@ -133,10 +132,12 @@ class RateMaps:
         if not np.isfinite(activity).all():
             cell = int(np.flatnonzero(~np.isfinite(activity).all(axis=0))[0])
             raise MapError(f"RateMaps: activity of cell {cell} is not finite; leave such cells out")
+        from scipy.sparse import csr_array  # slow to import, not always needed
+
         index = self.bins.flat_index(positions)
         inside = np.flatnonzero(index >= 0)
         n_bins = self.counts.size
-        membership = sparse.csr_array(
+        membership = csr_array(
             (np.ones(len(inside)), (index[inside], inside)), shape=(n_bins, len(index))
         )
         self.sums = self.sums + (membership @ activity).T.reshape(self.sums.shape)
@@ -172,6 +173,8 @@ class RateMaps:
         visited = self.counts >= max(min_occupancy_samples, 1e-12)
         sums, counts = self.sums, self.counts
         if sigma_bins > 0.0:
+            from scipy import ndimage
+
             sums = ndimage.gaussian_filter(sums, (0.0, sigma_bins, sigma_bins), mode="constant")
             counts = ndimage.gaussian_filter(counts, sigma_bins, mode="constant")
         maps = np.full(sums.shape, np.nan)
@@ -289,6 +292,8 @@ def fields(
         >>> found.n_fields.tolist(), found.area_m2.round(3).tolist()
         ([2], [0.04])
     """
+    from scipy import ndimage
+
     maps = _as_maps("fields", maps)
     filled = np.where(np.isfinite(maps), maps, -np.inf)
     peak = np.maximum(filled.max(axis=(1, 2), keepdims=True), 0.0)
@@ -318,6 +323,8 @@ def label_regions(above: np.ndarray) -> tuple[np.ndarray, int]:
         >>> label_regions(np.array([[[True, False, True]], [[True, True, False]]]))
         (array([[[1, 0, 2]], [[3, 3, 0]]], dtype=int32), 3)
     """
+    from scipy import ndimage
+
     within_a_map = np.zeros((3, 3, 3), dtype=bool)
     within_a_map[1] = ndimage.generate_binary_structure(2, 1)
     labels = np.zeros(above.shape, np.int32)

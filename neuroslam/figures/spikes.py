@@ -7,7 +7,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.ndimage import uniform_filter1d
 
 from neuroslam.figures.style import CURVES, INK, LOOP, MAP, ODOMETRY, STYLE, new_figure, write_title
 
@@ -156,6 +155,8 @@ def plot_errors(
         title: Title of the whole figure.
         log: Use a logarithmic axis.
     """
+    from scipy.ndimage import uniform_filter1d  # slow to import, not always needed
+
     with mpl.rc_context(STYLE):
         figure = new_figure(5.4 * len(panels), 3.9, title)
         axes = figure.subplots(1, len(panels), squeeze=False).ravel()

@@ -5,8 +5,6 @@ each other. In a chain nothing is added, in a map of laps little.
 """
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from neuroslam.compiled import compiled
 
@@ -31,6 +29,9 @@ def factored(
         >>> factored(4.0 * one, np.ones((1, 3)), one[:0], np.zeros((0, 2), np.int64)).tolist()
         [[0.25, 0.25, 0.25]]
     """
+    from scipy.sparse import csc_array  # slow to import, not always needed
+    from scipy.sparse.linalg import splu
+
     n, inner = len(slope), np.arange(3)
     every = np.arange(n)
     values = np.concatenate([diagonal, blocks, blocks.transpose(0, 2, 1)])
@@ -38,7 +39,7 @@ def factored(
     rows = np.broadcast_to(3 * at[:, 0, None, None] + inner[:, None], values.shape)
     columns = np.broadcast_to(3 * at[:, 1, None, None] + inner, values.shape)
     places = rows.ravel(), columns.ravel()
-    whole = sparse.csc_array((values.ravel(), places), shape=(3 * n, 3 * n))
+    whole = csc_array((values.ravel(), places), shape=(3 * n, 3 * n))
     solution: np.ndarray = splu(whole).solve(slope.ravel())
     return solution.reshape(-1, 3)
 

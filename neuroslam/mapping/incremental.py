@@ -20,7 +20,6 @@ most :data:`TRIALS` are tried in an update.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from neuroslam import compiled as switch
 from neuroslam.errors import MapError
@@ -35,8 +34,9 @@ from neuroslam.mapping.pose_graph import (
 )
 from neuroslam.mapping.tables import Links, closes_loop
 
-GATE = float(chdtri(3.0, 0.001)) / 3.0
-r""":math:`\Phi`. One correct link in a thousand has a squared residual above :math:`3 \Phi`."""
+GATE = 16.266236196238129 / 3.0
+r""":math:`\Phi`. One correct link in a thousand has a squared residual above :math:`3 \Phi`,
+the quantile of :math:`\chi^2_3`."""
 
 REJECTED = 0.25
 r"""Weight below which a link counts as rejected: that of :math:`\chi^2 = 3 \Phi`."""

@@ -9,15 +9,16 @@ facing of the target as seen from the source. Its residual, in units of its stan
 and the solution minimises :math:`\sum w \lVert r \rVert^2`.
 """
 
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
-from scipy.special import chdtri
 
 from neuroslam.errors import MapError
 from neuroslam.geometry import wrap_angles
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+    from scipy.sparse.linalg import SuperLU
 
 FIRST_TRIED = 16
 """Rejectable links that the first stage tests."""
@@ -172,8 +173,10 @@ def _residuals(poses: np.ndarray, links: _Links) -> np.ndarray:
     return residuals
 
 
-def _jacobian(poses: np.ndarray, links: _Links) -> sparse.csr_array:
+def _jacobian(poses: np.ndarray, links: _Links) -> "csr_array":
     """Return the derivative of the residuals, ``(3 links, 3 n)``; zero for the first pose."""
+    from scipy.sparse import csr_array  # slow to import, not always needed
+
     theta = poses[links.source, 2]
     dx, dy = (poses[links.target, :2] - poses[links.source, :2]).T
     by_x, by_y, by_turn = links.scale.T
@@ -194,19 +197,22 @@ def _jacobian(poses: np.ndarray, links: _Links) -> sparse.csr_array:
     )
     values[columns < 3] = 0.0
     shape = (3 * len(links.source), 3 * len(poses))
-    return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
+    return csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
-def _factor(normal: Any, damping: float) -> SuperLU:  # noqa: ANN401 - scipy's products are untyped
+def _factor(normal: Any, damping: float) -> "SuperLU":  # noqa: ANN401 - scipy's products are untyped
     """Factorise the damped normal equations, a sparse matrix.
 
     The tiny constant on the diagonal fixes what no link fixes: the first pose, and parts of the map
     that are not connected to it.
     """
+    from scipy.sparse import csc_array, diags_array
+    from scipy.sparse.linalg import splu
+
     diagonal = normal.diagonal()
-    held = normal + sparse.diags_array(damping * diagonal + 1e-12 * max(diagonal.max(), 1.0))
+    held = normal + diags_array(damping * diagonal + 1e-12 * max(diagonal.max(), 1.0))
     return splu(
-        sparse.csc_array(held),
+        csc_array(held),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
@@ -215,15 +221,17 @@ def _factor(normal: Any, damping: float) -> SuperLU:  # noqa: ANN401 - scipy's p
 
 def _headings_then_positions(poses: np.ndarray, links: _Links) -> np.ndarray:
     """Solve for the headings, then for the positions: two linear problems, a good initial guess."""
+    from scipy.sparse import csr_array, diags_array
+
     n = len(poses)
     ends = np.concatenate([links.source, links.target])
     rows = np.tile(np.arange(len(links.source)), 2)
     signs = np.repeat([-1.0, 1.0], len(links.source)) * (ends > 0)
-    difference = sparse.csr_array((signs, (rows, ends)), shape=(len(links.source), n))
+    difference = csr_array((signs, (rows, ends)), shape=(len(links.source), n))
     start, measured = poses[links.source], links.measured
 
     def least(values: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        scaled = sparse.diags_array(scale) @ difference
+        scaled = diags_array(scale) @ difference
         solution: np.ndarray = _factor(scaled.T @ scaled, 0.0).solve(
             scaled.T @ (values.T * scale).T
         )
@@ -283,6 +291,8 @@ def _select_inliers(
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Add rejectable links in stages; return poses, weights (0: rejected) and number of steps."""
+    from scipy.special import chdtri
+
     generator = np.random.default_rng(seed)
     weights = np.where(rejectable, 0.0, confidence)
     gate = chdtri(2.0 + (links.scale[:, 2] > 0), FALSE_ALARM)

@@ -3,9 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from neuroslam.geometry import rotate_points, wrap_angles
 from neuroslam.state.match import Pairs
@@ -61,6 +58,10 @@ def agreeing(
     n = len(pairs.partial)
     if n == 0:
         return []
+    from scipy.sparse import coo_array  # slow to import, not always needed
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
     z, u = partial_poses[pairs.partial], loaded_poses[pairs.loaded]
     i, j = cKDTree(z[:, :2]).query_pairs(tolerance.near_m, output_type="ndarray").T
     apart = np.linalg.norm(z[j, :2] - z[i, :2], axis=1)

@@ -1,10 +1,11 @@
 """Quickest and shortest paths through a map."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import dijkstra
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 class Plan(NamedTuple):
@@ -42,6 +43,8 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
     for name, experience in (("start", start), ("goal", goal)):
         if not 0 <= experience < n:
             return Plan([], np.inf, f"{name} {experience} is not in a map of {n} experiences")
+    from scipy.sparse.csgraph import dijkstra  # slow to import, not always needed
+
     graph = _graph(links[0], links[1], links[-1], n)
     distance, before = dijkstra(graph, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
@@ -68,13 +71,17 @@ def shortest_path_lengths(links: tuple[np.ndarray, ...], n: int, start: int) -> 
         >>> shortest_path_lengths(links, 3, 2).tolist()
         [6.0, 1.0, 0.0]
     """
+    from scipy.sparse.csgraph import dijkstra
+
     source, target, distance_m = links[:3]
     lengths: np.ndarray = dijkstra(_graph(source, target, distance_m, n), indices=start)
     return lengths
 
 
-def _graph(source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int) -> csr_array:
+def _graph(source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int) -> "csr_array":
     """Return links in both directions; weights are above 0, as csgraph reads 0 as no edge."""
+    from scipy.sparse import coo_array
+
     pairs = np.concatenate([source * n + target, target * n + source])
     weights = np.maximum(np.concatenate([weight, weight]), 1e-9)
     order = np.lexsort((weights, pairs))  # coo sums duplicates: keep the least of each pair

@@ -23,8 +23,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
-from scipy.special import fdtri
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import counted
@@ -131,6 +129,8 @@ def check_consistency(
         rejectable=rejectable if robust else None,
         max_iterations=ITERATIONS,
     )
+    from scipy.special import fdtri  # slow to import, not always needed
+
     inlier = report.weights[rejectable] > 0
     n_free, rate = max(3 * (int(inlier.sum()) - 1), 1), config.sessions.false_alarm
     return Consistency(
@@ -250,6 +250,8 @@ def common_path(result: Consistency, config: BrainConfig) -> np.ndarray:
 
     They have a loaded experience within the size of an experience, at most 20 degrees away.
     """
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
     cells = config.pose_cells
     place_m = cells.create_threshold_cells * cells.cell_size_m
     near = cKDTree(result.loaded[:, :2]).query_ball_point(result.partial[:, :2], place_m)

@@ -7,7 +7,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, RunError, SourceError, counted
@@ -318,13 +317,20 @@ def best_offset(seen: Turns, measured: Turns) -> Offset:
     return Offset(coarse_s + float(fine[at]), found[at], float(common[best]) * step_s)
 
 
+def _convolved(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Convolve two series by their Fourier transforms; ``scipy.signal`` loads for half a second."""
+    n = len(x) + len(y) - 1
+    padded = 1 << (n - 1).bit_length()
+    return np.fft.irfft(np.fft.rfft(x, padded) * np.fft.rfft(y, padded), padded)[:n]
+
+
 def _correlations(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Correlate ``a[i + lag]`` with ``b[i]`` at all lags: lags, correlations, common samples."""
     a, b = a - a.mean(), b - b.mean()
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
 
     def summed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return fftconvolve(x, y[::-1])
+        return _convolved(x, y[::-1])
 
     n = np.maximum(np.round(summed(ones_a, ones_b)), 1.0)
     sum_a, sum_b = summed(a, ones_b), summed(ones_a, b)
@@ -346,7 +352,7 @@ def _chance(a: np.ndarray, b: np.ndarray, n: int) -> float:
     """
     memory = []
     for x in (a - a.mean(), b - b.mean()):
-        full = fftconvolve(x, x[::-1])[len(x) - 1 :]
+        full = _convolved(x, x[::-1])[len(x) - 1 :]
         memory.append(full / full[0])
     length = min(len(a), len(b)) // 4
     both = memory[0][:length] * memory[1][:length]
