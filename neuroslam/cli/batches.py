@@ -171,7 +171,9 @@ def fleet_command(
 
 
 def experiment_command(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="One of: " + ", ".join(EXPERIMENTS))],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="all, or one of: " + ", ".join(EXPERIMENTS))
+    ],
     out: Out,
     data: Annotated[
         Path | None,
@@ -195,10 +197,30 @@ def experiment_command(
             "own poses and sequences.",
         ),
     ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="all: shorter simulations with fewer animals."),
+    ] = False,
 ) -> int:
-    """Reproduce an experiment of a paper."""
-    from neuroslam.experiments import run_experiment
+    """Reproduce an experiment of a paper, or all of them with one page that compares them."""
+    from neuroslam.experiments import run_all, run_experiment
 
+    if name == "all":
+        if jobs is not None or ray is not None or network or sequence is not None:
+            raise ConfigError(
+                "experiment all: takes --data and --quick; leave --jobs, --ray, --network and "
+                "--sequence out, or run one experiment by its name"
+            )
+        lines = run_all(data, out, quick=quick, say=say)
+        met = [line.claim.met(line.value) for line in lines if line.value is not None]
+        say(
+            f"{counted(len(lines), 'value')} of the papers: {met.count(True)} met, "
+            f"{met.count(False)} not met, {len(lines) - len(met)} not measured"
+        )
+        say(f"Written: {out / 'reproduction.md'}")
+        return 0
+    if quick:
+        raise ConfigError("--quick: belongs to experiment all; leave it out")
     networks = dict(_name_and_file(text) for text in network or [])
     rows = run_experiment(name, data, out, jobs, ray, networks, sequence)
     few = len({key for row in rows for key in row}) <= 9

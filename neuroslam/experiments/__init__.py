@@ -1,12 +1,15 @@
 """Experiments of the papers; each writes ``results.json`` and its figures into a folder."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuroslam.errors import RunError, did_you_mean
+
+if TYPE_CHECKING:
+    from neuroslam.experiments.reproduce import Line
 
 _SESSIONS = "neuroslam.experiments.multisession"
 
@@ -65,6 +68,7 @@ def run_experiment(
     ray: str | None = None,
     networks: Mapping[str, Path] | None = None,
     sequence: str | None = None,
+    arguments: Mapping[str, Any] | None = None,
 ) -> list[dict[str, Any]]:
     """Run an experiment and return its rows; their keys carry units.
 
@@ -76,6 +80,7 @@ def run_experiment(
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
         networks: ``view.features`` -> file of weights, for experiments that compare views.
         sequence: Number of a KITTI sequence, for experiments on one; ``None``: 00.
+        arguments: Further arguments of the experiment's function, such as ``minutes``.
 
     Raises:
         RunError: If there is no such experiment, its recording is missing, or it has no independent
@@ -88,7 +93,7 @@ def run_experiment(
         )
     module, function, folder = EXPERIMENTS[name]
     experiment = getattr(import_module(module), function)
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = dict(arguments or {})
     if sequence is not None:
         from neuroslam.worlds.landmark_paths import KITTI_SEQUENCES
 
@@ -121,6 +126,34 @@ def run_experiment(
         options |= {"jobs": jobs, "ray": ray}
     rows: list[dict[str, Any]] = experiment(recordings, Path(out), **options)["rows"]
     return rows
+
+
+def run_all(
+    data: Path | None,
+    out: Path,
+    *,
+    quick: bool = False,
+    names: Sequence[str] | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> "list[Line]":
+    """Run every experiment that holds values of the papers, and write one page about them.
+
+    See :func:`neuroslam.experiments.reproduce.reproduce`.
+
+    Args:
+        data: Folder that holds the folders of the recordings; ``None``: experiments that need one
+            are lines without a value.
+        out: Folder to write.
+        quick: The smaller size, minutes in place of hours.
+        names: Experiments to run; ``None``: all.
+        say: Called with the name of each experiment before it runs.
+    """
+    from neuroslam.experiments.reproduce import reproduce
+
+    def run(name: str, folder: Path, arguments: Mapping[str, Any]) -> None:
+        run_experiment(name, data, folder, arguments=arguments)
+
+    return reproduce(run, out, quick=quick, names=names, say=say)
 
 
 def _folder_of(folder: str | None, sequence: str, data: Path | None) -> str | None:
