@@ -35,6 +35,7 @@ LONGEST_S = 120.0  # of any command here; they take a second on an idle machine
 WORLD = "world:ellipse?laps=2&width=128&height=32"
 SHORT = "world:ellipse?laps=0.1&width=64&height=32"
 QUIET = "--no-tensorboard"
+MERGEABLE = ("--preset", "ratslam")  # `auto` may choose other settings for each
 _CHANGES = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate"}
 
 
@@ -246,9 +247,9 @@ def copies(base: Path, command: Command, size: int | None = None) -> Iterator[Pa
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _mount(folder: Path, size: int) -> None:
-    options = ["-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    subprocess.run(["mount", *options], check=True, capture_output=True)
+def _mount(folder: Path, size: int, how: str = "") -> None:
+    mount: list[str] = ["mount", "-t", "tmpfs", "-o", f"{how}size={size}", "tmpfs", str(folder)]
+    subprocess.run(mount, check=True, capture_output=True)
 
 
 # --- the campaign -------------------------------------------------------------------------------
@@ -337,6 +338,7 @@ def full_disks(base: Path, tally: Tally, n: int, rng: np.random.Generator) -> No
                 before = contents(out) if command.earlier else {}
                 done = call(*command.arguments, folder=folder)
                 found = spoken(done, (0, 2))
+                _mount(folder, 1 << 28, "remount,")  # what is left must do once there is room
                 if not found:
                     if command.reads:
                         before.pop("map.png", None)
@@ -407,14 +409,15 @@ def damages(base: Path, tally: Tally, n: int, rng: np.random.Generator) -> None:
 def prepare(base: Path) -> None:
     """Make the runs that the commands work on, and load what forked processes will need."""
     for arguments in (
-        ("run", WORLD, "--stop", "200", "-o", "a", QUIET),
-        ("run", WORLD, "--start", "100", "--stop", "300", "-o", "b", QUIET),
+        ("run", WORLD, "--stop", "200", "-o", "a", QUIET, *MERGEABLE),
+        ("run", WORLD, "--start", "100", "--stop", "300", "-o", "b", QUIET, *MERGEABLE),
         (*SWEEP, "-o", "sweep"),
         (*FLEET, "-o", "fleet"),
     ):
         with contextlib.chdir(base):
             assert main(list(arguments)) in (0, 3), arguments
-    for text in ("merge a b -o c", "plot c", "report c", "verify c", "export c c/map.g2o"):
+    texts = ("merge a b -o c", "plot c", "report c", "verify c", "export c c/map.g2o")
+    for text in texts:
         with contextlib.chdir(base):
             assert main(text.split()) == 0, text
 

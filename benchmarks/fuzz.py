@@ -116,6 +116,8 @@ def damaged_inputs(folder: Path, keep: Path | None, n: int, only: str) -> dict[s
     for number in range(n):
         kind = kinds[number % len(kinds)]
         draw = np.random.default_rng(number)
+        if number % 100 == 0:
+            print(f"{number} of {n} inputs", file=sys.stderr, flush=True)
         name = kind.damaged[int(draw.integers(len(kind.damaged)))]
         changed = {name: damage(kind.files[name], kind.is_text, draw)}
         at = laid(folder, kind, changed)
@@ -186,6 +188,8 @@ def crafted_brains(folder: Path, keep: Path | None, n: int) -> Counter[str]:
         at = folder / "crafted"
         shutil.rmtree(at, ignore_errors=True)
         shutil.copytree(out, at)
+        if number % 20 == 0:
+            print(f"{number} of {n} brains", file=sys.stderr, flush=True)
         name = crafted(at, number)
         found, seconds, mb = outcome(
             lambda at=at: command("verify", "@/brain.safetensors")(at), folder / "log"

@@ -165,6 +165,10 @@ class RunError(NeuroslamError, ValueError):
     """A run directory that cannot be written, resumed or read."""
 
 
+class WriteError(RunError):
+    """A run directory that cannot be written: a full disk, a missing permission."""
+
+
 class SpaceError(NeuroslamError, ValueError):
     """Vectors or positions that do not fit a semantic map: wrong dimension, NaN, unknown name."""
 

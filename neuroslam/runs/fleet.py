@@ -12,7 +12,7 @@ import numpy as np
 
 from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import MapError, NeuroslamError, RunError, counted
+from neuroslam.errors import MapError, NeuroslamError, RunError, WriteError, counted
 from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.figures.sessions import Stage, plot_stages
 from neuroslam.figures.style import SESSIONS, plain_text, save, shortened
@@ -122,8 +122,9 @@ def fleet(
         does not stop the others.
 
     Raises:
-        RunError: If there are fewer than two sources, or ``out`` holds a fleet already or cannot be
-            written, or Ray cannot be reached.
+        RunError: If there are fewer than two sources, or ``out`` holds a fleet already, or Ray
+            cannot be reached.
+        WriteError: If ``out``, or a run or merge in it, cannot be written.
     """
     out = Path(out).resolve()
     if len(sources) < 2:
@@ -184,6 +185,8 @@ def _collect(
     found: dict[int, Any] = {}
     with closing(outcomes(function, orders, jobs, ray)) as each:
         for number, outcome in each:
+            if isinstance(outcome, WriteError):  # a full disk fails all that follow
+                raise outcome
             found[number] = outcome
             if on_done is not None:
                 on_done(what, len(found), len(orders))

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, WriteError
 from neuroslam.state.files import sync_folder
 
 try:
@@ -73,7 +73,8 @@ def writing(out: Path) -> Iterator[Folder]:
     when the process ends, however it ends.
 
     Raises:
-        RunError: If another process has locked it, or it cannot be written.
+        RunError: If another process has locked it.
+        WriteError: If it cannot be written.
     """
     new = not out.exists()
     try:
@@ -89,7 +90,7 @@ def writing(out: Path) -> Iterator[Folder]:
             finally:
                 _discard(out / STAGED)
     except OSError as error:
-        raise RunError(f"{out}: cannot be written ({error.strerror or error})") from None
+        raise WriteError(f"{out}: cannot be written ({error.strerror or error})") from None
     finally:
         if new:
             with contextlib.suppress(OSError):

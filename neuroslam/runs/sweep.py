@@ -13,7 +13,7 @@ from typing import Any
 
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import section_class
-from neuroslam.errors import ConfigError, NeuroslamError, RunError, csv_text
+from neuroslam.errors import ConfigError, NeuroslamError, RunError, WriteError, csv_text
 from neuroslam.figures.style import save
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.limits import parse_toml
@@ -234,7 +234,8 @@ def sweep(
 
     Raises:
         NeuroslamError: If the sweep cannot start: as for :func:`plan_sweep`, or ``out`` holds a
-            sweep already or cannot be written, or Ray cannot be reached.
+            sweep already, or Ray cannot be reached.
+        WriteError: If ``out``, or a run in it, cannot be written.
         KeyboardInterrupt: If it is interrupted; the summary holds the runs that ended before.
     """
     out = Path(out).resolve()
@@ -251,9 +252,14 @@ def sweep(
         try:
             with closing(outcomes(_map, orders, jobs, ray)) as each:
                 for number, outcome in each:
+                    if isinstance(outcome, WriteError):  # a full disk fails all that follow
+                        raise outcome
                     found[number] = figures(outcome, inside / trials[number].name)
                     if on_done is not None:
                         on_done(len(found), len(trials))
+        except WriteError:
+            found.clear()  # an earlier sweep stays
+            raise
         finally:
             rows = [
                 {"run": trial.name} | trial.varied | found.get(k, {"error": "interrupted"})

@@ -15,8 +15,10 @@ from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
+from neuroslam.brain.soundness import _expected, _fits, _surely_connected
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
+from neuroslam.mapping.tables import Links
 from neuroslam.sensors import open_source
 from neuroslam.state.files import save_checked, tensors_digest
 from neuroslam.types import Frame
@@ -222,3 +224,35 @@ def test_a_brain_of_the_first_format_is_one_session(brain, tmp_path):
     assert origins.number.tolist() == list(range(brain.map.n))
     assert set(origins.session.tolist()) == {loaded.sessions.now.id}
     assert loaded.map.state.made == brain.map.n
+
+
+# --- quick checks -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cells", ["pose", "pose+place+semantic+head_direction+speed"])
+def test_a_new_brain_is_found_sound_by_the_quick_check_and_no_altered_one(cells):
+    values = {"cells": cells, "semantic": {"space": {"n_scales": 2, "n_rotations": 2}}}
+    brain = NavigationBrain(BrainConfig.model_validate(values))
+    state, expected = dict(brain.state_dict()), _expected(brain)
+    assert _fits(state, expected)
+    for name, tensor in state.items():
+        rest = {key: value for key, value in state.items() if key != name}
+        assert not _fits(rest, expected)
+        assert not _fits(rest | {f"{name}_": tensor}, expected)
+        assert not _fits(state | {name: tensor.unsqueeze(0)}, expected)
+        assert not _fits(state | {name: tensor.to(torch.float16)}, expected)
+    assert not _fits(
+        state | {"map.links_table.source": torch.zeros(1, dtype=torch.int64)}, expected
+    )
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "connected"),
+    [([0, 1], [1, 2], True), ([2, 0], [0, 1], True), ([0, 2], [1, 2], False), ([0], [1], False),
+     ([0, 1], [1, 3], False), ([0, -1], [1, 2], False)],
+)  # fmt: skip
+def test_a_map_is_surely_connected_if_each_experience_is_linked_to_an_earlier_one(
+    source, target, connected
+):
+    empty = [np.zeros(len(source))] * (len(Links._fields) - 2)
+    assert _surely_connected(Links(np.array(source), np.array(target), *empty), 3) == connected

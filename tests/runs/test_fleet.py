@@ -8,7 +8,7 @@ import pytest
 
 from neuroslam import load_brain
 from neuroslam.config import BrainConfig
-from neuroslam.errors import RunError
+from neuroslam.errors import RunError, WriteError
 from neuroslam.runs.files import RUN_FILES, TIMINGS
 from neuroslam.runs.fleet import FleetReport, Part, _names, _pairs, fleet
 from neuroslam.runs.manifest import MANIFEST
@@ -187,3 +187,20 @@ def test_more_sessions_than_colours_can_be_drawn(tmp_path):
     assert len(report.apart) == 7
     assert (tmp_path / "out" / "fleet.png").stat().st_size > 10_000
     assert np.all([part["reasons"] for part in report.apart])
+
+
+def test_a_disk_that_is_full_at_a_merge_ends_a_fleet_and_the_earlier_one_stays(
+    tmp_path, monkeypatch
+):
+    def full(*_arguments, **_options):
+        raise WriteError("merges/1-1: cannot be written (No space left on device)")
+
+    (tmp_path / "sessions").mkdir()
+    (tmp_path / "fleet.json").write_text("{}")
+    monkeypatch.setattr("neuroslam.runs.fleet.merge_runs", full)
+    monkeypatch.setattr("neuroslam.runs.fleet.run_one", lambda *_a, **_o: {"error": ""})
+    monkeypatch.setattr("neuroslam.runs.fleet.figures", lambda *_a: {"error": ""})
+    with pytest.raises(WriteError, match="No space left"):
+        fleet(SOURCES[:2], tmp_path, overwrite=True)
+    assert (tmp_path / "fleet.json").read_text() == "{}"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fleet.json", "sessions"]

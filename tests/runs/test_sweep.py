@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from neuroslam import load_brain
-from neuroslam.errors import ConfigError, NeuroslamError, RunError, SourceError
+from neuroslam.errors import ConfigError, NeuroslamError, RunError, SourceError, WriteError
 from neuroslam.figures.sweep import plot_sweep
 from neuroslam.runs.files import RUN_FILES, TIMINGS
 from neuroslam.runs.manifest import MANIFEST
@@ -324,3 +324,21 @@ def test_a_sweep_prints_the_notes_of_the_readers_once_and_truth_where_it_is_part
     assert done.out.count("a.csv: has no times; 20 frames per second assumed") == 1
     done = call("sweep", WORLD, "--seeds", "2", "--stop", "8", "-o", tmp_path / "w")
     assert "frames with truth" not in " ".join(done.out.split())
+
+
+def test_a_disk_that_is_full_at_a_run_ends_a_sweep_and_the_earlier_one_stays(tmp_path, monkeypatch):
+    ended = []
+
+    def full(*_arguments, **_options):
+        ended.append(1)
+        if len(ended) == 2:
+            raise WriteError("2: cannot be written (No space left on device)")
+        return {"error": ""}
+
+    (tmp_path / "sweep.json").write_text("{}")
+    monkeypatch.setattr("neuroslam.runs.sweep.run_one", full)
+    with pytest.raises(WriteError, match="No space left"):
+        sweep([WORLD], tmp_path, vary=["map.loops=1,2,3"], stop=9, overwrite=True)
+    assert len(ended) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
+    assert (tmp_path / "sweep.json").read_text() == "{}"
