@@ -199,6 +199,13 @@ def evaluate_command(
         str | None,
         typer.Option(metavar="AXES", help="The same of TRACK, if it is a TUM file."),
     ] = None,
+    relations: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="True relative poses, t1 t2 x y z roll pitch yaw a line: Kuemmerle's metric.",
+        ),
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(metavar="RUN", help="Compare the map with that of another run, by ICP."),
@@ -209,8 +216,18 @@ def evaluate_command(
     ] = None,
 ) -> int:
     """Compare a trajectory with the ground truth, or a map with that of another run."""
-    from neuroslam.runs.evaluate import compare_maps, evaluate
+    from neuroslam.runs.evaluate import compare_maps, evaluate, evaluate_relations
 
+    if relations is not None:
+        if truth is not None or against is not None:
+            raise RunError("--relations: compares with relative poses alone; leave the others out")
+        table = Table(title=printable(f"{track} and the relations of {relations}"))
+        for column in ("relations", "number", "position, mean (m)", "heading, mean (°)"):
+            table.add_column(column, justify="left" if column == "relations" else "right")
+        for name, number, metres, degrees in evaluate_relations(track, relations):
+            table.add_row(name, str(number), f"{metres:.4f}", f"{degrees:.3f}")
+        say(table)
+        return 0
     if against is None and to is not None:
         raise RunError("--out: is the figure of --against RUN; give both, or neither")
     if against is not None and truth is not None:

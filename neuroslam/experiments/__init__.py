@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "view-matching": ("neuroslam.experiments.view_matching", "view_matching", "rtabmap_corridor"),
     "vpr-corridor": (_RECOGNITION, "vpr_corridor", "vpr_corridor"),
     "rtabmap-corridor": (_RECOGNITION, "rtabmap_corridor", "rtabmap_corridor"),
+    "laser-robots": ("neuroslam.experiments.laser_robots", "laser_robots", "radish"),
     "virtual-tour": (_SESSIONS, "virtual_tour", None),
     "virtual-tour-no-shift": (_SESSIONS, "virtual_tour_no_shift", None),
     "lab-tour": (_SESSIONS, "lab_tour", None),

@@ -10,6 +10,7 @@ import numpy as np
 from neuroslam.brain import load_brain
 from neuroslam.errors import RunError, counted
 from neuroslam.evaluation.icp import IcpMode, fraction_of_diagonal, map_rmse
+from neuroslam.evaluation.relations import FAR_S, read_relations, relation_errors
 from neuroslam.evaluation.trajectory import (
     AlignmentMode,
     ErrorStatistics,
@@ -187,6 +188,37 @@ def _note_scale(
             f"the truth is {scale:.4g} times as large as the track; with that scale the ATE is "
             f"{free.rmse:.4f} m (--align similarity)"
         )
+
+
+def evaluate_relations(
+    track: str | Path, relations: str | Path
+) -> list[tuple[str, int, float, float]]:
+    """Compare a trajectory with true relative poses, by the metric of Kuemmerle et al.
+
+    Args:
+        track: Folder of a run, or a TUM file.
+        relations: File of relations, see :func:`~neuroslam.evaluation.relations.read_relations`.
+
+    Returns:
+        For all relations, and for those that span more than 100 s: name, number, mean error of the
+        position (m) and of the heading (degrees).
+
+    Raises:
+        NeuroslamError: If a file is missing or damaged, or no relation has poses.
+    """
+    path = Path(track)
+    found = read_tum(track_file(path) if path.is_dir() else path)
+    errors = relation_errors(found.times_s, found.poses, read_relations(relations))
+    rows = []
+    for name, chosen in (
+        ("all", np.ones(len(errors.far), dtype=bool)),
+        (f"over more than {FAR_S:g} s", errors.far),
+    ):
+        if chosen.any():
+            metres = float(errors.translation_m[chosen].mean())
+            degrees = math.degrees(float(errors.rotation_rad[chosen].mean()))
+            rows.append((name, int(chosen.sum()), metres, degrees))
+    return rows
 
 
 class MapComparison(NamedTuple):

@@ -12,10 +12,10 @@ A text file, also compressed by gzip or bzip2, with a message on each line: name
 ===============  =================================================================================
 
 There is a frame for each scan; its motion is the change of the robot's odometry since the scan
-before. A log without scans has a frame for each ``ODOM``. Times are those of the logger in seconds
-from the beginning of the log, or ``ipc_timestamp`` where the logger wrote none. The messages are in
-the order in which the robot measured; a stamp that is later than one further down is replaced by
-interpolation. ``RLASER``, ``TRUEPOS``, ``NMEA`` and others are not read.
+before. A log without scans has a frame for each ``ODOM``. Times are those of the measurement,
+``ipc_timestamp``, or ``logger_timestamp`` where those stand still. The messages are in the order in
+which the robot measured; a stamp that is later than one further down is replaced by interpolation.
+``RLASER``, ``TRUEPOS``, ``NMEA`` and others are not read.
 """
 
 import bz2
@@ -203,11 +203,11 @@ def _pose_and_times(line: bytes, kind: bytes) -> list[float]:
 
 
 def _times(columns: np.ndarray) -> np.ndarray:
-    """Choose the logger's times, or those of IPC where the logger's do not run."""
+    """Choose the times of the measurements, or those of the logger where the others stand still."""
     logger, ipc = columns.T
-    known = np.isfinite(logger)
-    runs = known.any() and (np.ptp(logger[known]) > 0.0 or (len(logger) == 1 and logger[0] > 0.0))
-    return np.asarray(logger if runs else ipc)
+    known = np.isfinite(ipc)
+    stands = not known.any() or (len(ipc) > 1 and np.ptp(ipc[known]) == 0.0)
+    return np.asarray(logger if stands else ipc)
 
 
 def _rising_times(times_s: np.ndarray) -> tuple[np.ndarray, int]:

@@ -22,7 +22,7 @@ def flaser(x, time_s, n=180, ranges=None):
     angles = np.radians(np.arange(n) - 90.0)
     ranges = 2.0 / np.maximum(np.cos(angles), 1e-3) if ranges is None else ranges
     pose = f"{x:.3f} 0.0 0.0"
-    return f"FLASER {n} {' '.join(f'{r:.3f}' for r in ranges)} {pose} {pose} 9.0 host {time_s}"
+    return f"FLASER {n} {' '.join(f'{r:.3f}' for r in ranges)} {pose} {pose} {time_s} host 9.0"
 
 
 LOG = "\n".join(
@@ -65,7 +65,7 @@ def test_robotlaser1_says_its_own_angles_and_range(tmp_path):
     ranges = source.frame(0).ranges
     assert np.flatnonzero(np.isfinite(ranges)).tolist() == [*range(30), *range(330, 360)]
     assert source.odometry.tolist() == [[1.0, 2.0, 0.3]]
-    assert source.frame(0).time_s == 3.0
+    assert source.frame(0).time_s == 12.0
 
 
 def test_a_log_without_messages_is_refused(tmp_path):
