@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
+from neuroslam.brain.forgetting import forget
 from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame, SourceError, first_line
 from neuroslam.odometry.visual import Profiles
@@ -260,6 +261,11 @@ class NavigationBrain(BrainState):
         if arrived and encoded is not None and self._recognise(frame, encoded, view):
             view = view._replace(template=self.view.last.template, is_new=False)
             cells, action, experience = self.leader.estimate, "set", self.map.current
+        if self.map.forgets and arrived and forget(self):
+            experience, template = self.map.current, view.template
+            if template != NO_TEMPLATE:
+                template = int(self.map.experiences.array("template")[experience])
+            view = view._replace(template=template)
         return StepResult(
             frame=frame.index,
             time_s=frame.time_s,

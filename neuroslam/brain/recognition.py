@@ -10,6 +10,7 @@ from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
 from neuroslam.state.join import Join
 from neuroslam.state.match import Pairs
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.templates import LocalViewCells
@@ -70,6 +71,11 @@ class Recognition(Mergeable):
         )
         # For each stored map: number of matched experiences, and the most that agreed.
         self.tally = GrowingTable({"alike": ((), torch.int64), "agreed": ((), torch.int64)})
+
+    def renumber(self, change: Renumbering) -> None:
+        """Follow the ids of the present map."""
+        partial = self.sightings.array("partial")
+        partial[:] = change.experiences[partial]
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Drop all matches: the ids have changed."""

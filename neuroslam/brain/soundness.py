@@ -178,7 +178,10 @@ def _faults(state: State, log: Mapping[str, Any], config: BrainConfig) -> Iterat
         ("map.links_table.target", n, "experiences"),
         ("map.goals.experience", n, "experiences"),
         ("map.aliases.experience", n, "experiences"),
+        ("map.forgotten.experience", n, "experiences"),
     ):
+        if name not in s:  # a table that is empty
+            continue
         lowest = -1 if name.endswith("template") and not leading_class(config).relaxes_map else 0
         if not _within(s[name], lowest, limit - 1):
             rows = np.flatnonzero((s[name] < lowest) | (s[name] >= limit))
@@ -189,6 +192,9 @@ def _faults(state: State, log: Mapping[str, Any], config: BrainConfig) -> Iterat
         lowest = 0 if n and name == "map.state.current" else -1
         if not lowest <= s[name] < limit:
             yield f"{name}: is {s[name]}; expected {lowest} to {limit - 1}"
+    used = len(s.get("map.usage.at", ()))
+    if used > n:
+        yield f"map.usage: {used} rows for {n} experiences"
     yield from _link_faults(s, n)
     yield from _bound_faults(s["map.experiences.cell"], config)
     for population in population_classes(config):

@@ -32,7 +32,7 @@ from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, QuickModule, State
 from neuroslam.state.pickling import Calls, as_arrays, as_tensors
 from neuroslam.state.population import Population
-from neuroslam.state.registry import leading_class, population_classes
+from neuroslam.state.registry import check_forgetting, leading_class, population_classes
 from neuroslam.state.sessions import Session, SessionLog, session_id
 from neuroslam.state.tables import Scalars
 from neuroslam.threads import limit_threads, usable_threads
@@ -95,6 +95,7 @@ class BrainState(QuickModule):
         super().__init__()
         self.config = config or BrainConfig()
         check_size(self.config)
+        check_forgetting(self.config)
         self._encoder = view_encoder(self.config.view, features)
         # Source, preset and date of the next session.
         self.about: tuple[str, str, str] = ("", "", "")

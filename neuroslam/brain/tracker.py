@@ -13,6 +13,7 @@ from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, within_links
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_EXPERIENCE, Motion, Pose, Revoked, Tracking
 
@@ -167,6 +168,15 @@ class SequenceTracker(Mergeable):
     def tracks(self) -> bool:
         """Whether the robot is at known places."""
         return self.state.mode == Mode.TRACKS
+
+    def renumber(self, change: Renumbering) -> None:
+        """Keep the evidence of the experiences that are kept."""
+        rows = {
+            name: change.rows_of_experiences(self.evidence[name]) for name in self.evidence.columns
+        }
+        self.evidence.replace(**rows)
+        for name in ("candidate", "began", "jumped", "origin", "joined"):
+            setattr(self.state, name, change.experience(getattr(self.state, name)))
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Forget the evidence, whose ids have changed; every experience is an old one."""

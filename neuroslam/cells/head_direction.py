@@ -27,6 +27,7 @@ from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State, renamed, without_gradients
 from neuroslam.state.population import Belief, Correction, Population, StepInput
 from neuroslam.state.registry import register
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Frame, Motion, ViewMatch
 
@@ -742,6 +743,11 @@ class HeadDirectionCells(Population):
             yield f"{n_views} views, {len(views)} of them with a heading"
         if not -1 <= state["last.view"] < n_views:
             yield f"head_direction.last.view: is {state['last.view']}, expected -1 to {n_views - 1}"
+
+    def renumber(self, change: Renumbering) -> None:
+        """Drop the headings of views that are not kept."""
+        self.views.replace(heading_rad=change.rows_of_views(self.views["heading_rad"]))
+        self.last.view = change.view(self.last.view)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Rotate the partial session's bump and headings into the loaded frame; merge the views.

@@ -37,6 +37,7 @@ from neuroslam.state.population import (
     StepInput,
 )
 from neuroslam.state.registry import leading_class, register
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable
 from neuroslam.types import (
     NO_EXPERIENCE,
@@ -531,6 +532,14 @@ class NavigationCells(Population):
     ) -> Iterator[str]:
         """Yield references to place cells, links or walls that do not exist."""
         yield from navigation_faults(state, n_experiences if leading_class(config) is cls else None)
+
+    def renumber(self, change: Renumbering) -> None:
+        """Drop the positions of views that are not kept."""
+        if self.seen.n:
+            self.seen.replace(
+                **{name: change.rows_of_views(self.seen[name]) for name in self.seen.columns}
+            )
+        self.now.last_view = change.view(self.now.last_view)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Merge place cells, walls and views of two sessions in the frame of the loaded one."""

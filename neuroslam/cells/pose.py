@@ -43,6 +43,7 @@ from neuroslam.state.population import (
     StepInput,
 )
 from neuroslam.state.registry import register
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
 
@@ -438,6 +439,13 @@ class PoseCellNetwork(Population):
         """Return the activity summed over heading, and over y: x-y, and x-heading."""
         activity = self.activity.numpy(force=True)
         return {"cells/activity": (activity.sum(axis=0), activity.sum(axis=1))}
+
+    def renumber(self, change: Renumbering) -> None:
+        """Drop the bindings of templates that are not kept."""
+        self.bindings.replace(
+            **{name: change.rows_of_views(self.bindings[name]) for name in self.bindings.columns}
+        )
+        self.last.view = change.view(self.last.view)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Move bindings and activity of the partial session on the torus, and merge the bindings.

@@ -371,6 +371,10 @@ class PoseCellConfig(Section):
         return self
 
 
+LEAST_EXPERIENCES = 100
+"""Smallest cap of a map: evidence of sequences needs some tens of experiences to compare."""
+
+
 class MapConfig(Section):
     """Experience map: a graph of experiences, relaxed until its links agree."""
 
@@ -431,6 +435,30 @@ class MapConfig(Section):
         default=False,
         description="pose-graph optimisation: reject loop closures that contradict the other links",
     )
+    max_experiences: int = Field(
+        default=0,
+        ge=0,
+        le=MOST_COUNT,
+        description="most experiences that the map keeps: the least used are forgotten, with their "
+        "templates, and their links joined; 100 or more; larger: more memory and time; 0: no limit",
+    )
+    consolidate_passes: int = Field(
+        default=0,
+        ge=0,
+        le=MOST_COUNT,
+        description="times in a row that the robot passes close by an experience without arriving "
+        "there, after which it becomes part of the one beside it, if their views are alike; "
+        "larger: the map keeps more; 0: never",
+    )
+
+    @model_validator(mode="after")
+    def _cap_leaves_a_map(self) -> Self:
+        if 0 < self.max_experiences < LEAST_EXPERIENCES:
+            raise ValueError(
+                f"max_experiences {self.max_experiences} is too small for a map; expected "
+                f"{LEAST_EXPERIENCES} or more, or 0 for no limit"
+            )
+        return self
 
 
 class SessionConfig(Section):

@@ -16,7 +16,9 @@ from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.planning import Plan
 from neuroslam.mapping.relax import Relaxation
 from neuroslam.mapping.tables import closes_loop
+from neuroslam.mapping.usage import close_to
 from neuroslam.state.population import Action, Correction
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.types import (
     NO_EXPERIENCE,
     NO_TEMPLATE,
@@ -424,10 +426,21 @@ class ExperienceMap(ExperienceGraph):
 
     def _arrive(self, experience: int, relative_heading_rad: float) -> None:
         s = self.state
+        if self.forgets:
+            self.usage.extend(self.n)
+            close = None
+            if self.config.consolidate_passes and self.n_links:
+                close = close_to(self.pose_table, experience, self.spacing_m)
+            self.usage.arrive(experience, self.half_life, close)
         s.current = experience
         s.dx_m = s.dy_m = s.since_s = 0.0
         heading = self.experiences.array("pose")[experience, 2].item()
         s.facing_rad = wrap_angle(heading + relative_heading_rad)
+
+    def renumber(self, change: Renumbering) -> None:
+        """Forget experiences; what follows from the links is made again."""
+        super().renumber(change)
+        self._relaxation = self._solver = None
 
     def _turn_offset(self, by_rad: float) -> None:
         """Keep the robot's pose relative to its experience when the experience turns."""

@@ -1,6 +1,7 @@
 """Graph of experiences and links: its state, and queries that leave it unchanged."""
 
 import math
+from collections.abc import Callable
 from typing import Self
 
 import numpy as np
@@ -8,10 +9,12 @@ import torch
 
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
-from neuroslam.geometry import rotate, wrap_angle
+from neuroslam.geometry import compose_poses, rotate, wrap_angle
+from neuroslam.mapping.forgetting import contract_links, least_used
 from neuroslam.mapping.incremental import link_weights
 from neuroslam.mapping.joining import merge_maps
 from neuroslam.mapping.planning import Plan, quickest_path, shortest_path_lengths
+from neuroslam.mapping.sequence import within_links
 from neuroslam.mapping.tables import (
     ALIAS_COLUMNS,
     EXPERIENCE_COLUMNS,
@@ -20,10 +23,18 @@ from neuroslam.mapping.tables import (
     Origins,
     origin_key,
 )
+from neuroslam.mapping.usage import HALF_LIFE, LONG, Forgotten, Usage, close_to
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_EXPERIENCE, Pose
+
+NEAR_LINKS = 3
+"""Links within which an experience is beside another: two strands become one from their ends."""
+
+MOST_FORGOTTEN = 65_536
+"""Forgotten experiences whose poses are kept for the trajectory: the latest, 4 MB of them."""
 
 
 class MapState(Scalars):
@@ -72,7 +83,8 @@ class ExperienceGraph(Mergeable):
     """Experiences, the links between them, and the pose of the robot; the base of the map.
 
     State: the tables ``experiences``, ``links_table``, ``goals`` and ``aliases`` (experiences that
-    a merge made part of others), and the numbers in ``state``.
+    a merge made part of others), and the numbers in ``state``; in a map that forgets also ``usage``
+    and ``forgotten`` (experiences that are part of others since then).
 
     Args:
         config: Solver, correction, loops.
@@ -94,6 +106,7 @@ class ExperienceGraph(Mergeable):
         self.links_table = GrowingTable(LINK_COLUMNS)
         self.goals = GrowingTable({"experience": ((), torch.int64), "until_s": ((), torch.float64)})
         self.aliases = GrowingTable(ALIAS_COLUMNS)
+        self.usage, self.forgotten = Usage(), Forgotten()
         self.state = MapState(config.initial_heading_deg)
 
     @property
@@ -219,15 +232,151 @@ class ExperienceGraph(Mergeable):
         return link_weights(self.pose_table, self.links, self.config.sigma_m, self.config.sigma_rad)
 
     def origins(self) -> Origins:
-        """Return the origin of every experience, also of those that a merge made part of others."""
-        own, other = (
+        """Return the origin of every experience, also of those that are part of others now."""
+        own, other, gone = (
             {name: table[name].numpy(force=True) for name in table.columns}
-            for table in (self.experiences, self.aliases)
+            for table in (self.experiences, self.aliases, self.forgotten)
         )
         own |= {"experience": np.arange(self.n), "turn_rad": np.zeros(self.n)}
+        gone |= dict(zip(("ahead_m", "left_m", "turn_rad"), gone.pop("pose").T, strict=True))
+        for rows, n in ((own, self.n), (other, self.aliases.n)):
+            rows |= {"ahead_m": np.zeros(n), "left_m": np.zeros(n)}
         kept = ~np.isin(origin_key(own), origin_key(other))  # an alias replaces the own row
-        columns = (np.concatenate([own[name][kept], other[name]]) for name in Origins._fields)
+        columns = (
+            np.concatenate([own[name][kept], other[name], gone[name]]) for name in Origins._fields
+        )
         return Origins(*columns)
+
+    @property
+    def forgets(self) -> bool:
+        """Whether experiences are forgotten, so that their use is counted."""
+        return bool(self.config.max_experiences or self.config.consolidate_passes)
+
+    @property
+    def half_life(self) -> float:
+        """Arrivals after which a visit counts half."""
+        return float(HALF_LIFE * (self.config.max_experiences or LONG))
+
+    @property
+    def spacing_m(self) -> float:
+        """Mean length of the links."""
+        return float(self.links_table.array("distance_m").mean())
+
+    def to_forget(self, protected: list[int]) -> np.ndarray:
+        """Choose the experiences beyond the cap and some more, so that it is not done every time.
+
+        Args:
+            protected: Ids that are kept in any case, beside those visited lately; -1: none.
+
+        Returns:
+            The experience that each is part of from now on, itself if it is kept, ``(n,)``.
+        """
+        most = self.config.max_experiences
+        keep = self._kept_anyway(protected)
+        keep |= self.usage.array("at") > self.usage.arrivals - min(64, most // 4)
+        count = self.n - most + most // 20
+        use = self.usage.log_use(self.half_life)
+        return least_used(use, self.links, self.pose_table, keep, count)
+
+    def to_consolidate(
+        self, protected: list[int], alike: Callable[[int, int], bool]
+    ) -> np.ndarray | None:
+        """Choose the experiences that the robot does not arrive at any more.
+
+        Each becomes part of the nearest one at most :data:`NEAR_LINKS` links away that the robot
+        does arrive at, if it is close and has a similar heading.
+
+        Args:
+            protected: Ids that are kept in any case; -1: none.
+            alike: Whether the views of two experiences show the same place.
+
+        Returns:
+            The experience that each is part of from now on, ``(n,)``; ``None``: there are too few
+            to do it now.
+        """
+        missed = self.usage.array("missed")
+        due = missed >= self.config.consolidate_passes
+        due &= ~self._kept_anyway(protected)[: len(due)]
+        if due.sum() < max(4, self.n // 64):
+            return None
+        source, target = (self.links_table.array(name) for name in ("source", "target"))
+        ends, others = np.concatenate([source, target]), np.concatenate([target, source])
+        into, poses = np.arange(self.n), self.pose_table
+        left, before = np.flatnonzero(due).tolist(), []
+        while left and left != before:  # one that has gone brings the next nearer to the rest
+            before, left = left, []
+            for k in before:
+                near = close_to(poses, k, self.spacing_m) & ~due
+                near &= within_links(k, 0, NEAR_LINKS, into[ends], into[others], self.n)
+                found = np.flatnonzero(near)
+                apart = poses[found, :2] - poses[k, :2]
+                order = np.argsort((apart * apart).sum(1), kind="stable")
+                other = next((j for j in found[order].tolist() if alike(k, j)), None)
+                if other is None:
+                    left.append(k)
+                else:
+                    into[k] = other
+        missed[left] = 0  # they show what no other does: they are looked at again later
+        return into
+
+    def _kept_anyway(self, protected: list[int]) -> np.ndarray:
+        """Return which experiences cannot be forgotten now, ``bool``, ``(n,)``."""
+        self.usage.extend(self.n)
+        keep = np.zeros(self.n, dtype=bool)
+        keep[[k for k in protected if k >= 0]] = True
+        keep[[0, self.state.current, *self.goals["experience"].tolist()]] = True
+        return keep
+
+    def renumber(self, change: Renumbering) -> None:
+        """Forget experiences: their links lead to the ones that they are part of from now on."""
+        ids, kept = change.experiences, change.kept_experiences
+        root = kept[ids]
+        links = contract_links(self.links, self.pose_table, root)
+        links = links._replace(source=ids[links.source], target=ids[links.target])
+        self._note_forgotten(change)
+        rows = {
+            name: change.rows_of_experiences(self.experiences[name])
+            for name in self.experiences.columns
+        }
+        views = change.views[rows["template"].numpy()]
+        rows["template"] = torch.from_numpy(views)
+        self.experiences.replace(**rows)
+        self.links_table.replace(**{k: torch.from_numpy(v) for k, v in links._asdict().items()})
+        if self.usage.n:
+            self.usage.replace(
+                **{c: change.rows_of_experiences(self.usage[c]) for c in self.usage.columns}
+            )
+        self.goals["experience"][:] = torch.from_numpy(ids[self.goals["experience"].numpy()])
+        self.state.current = change.experience(self.state.current)
+        self.state.at_rest = 0
+
+    def _note_forgotten(self, change: Renumbering) -> None:
+        """Append the experiences that are forgotten, and follow those that were before."""
+        ids, own, other, table = change.experiences, self.experiences, self.aliases, self.forgotten
+        gone = np.flatnonzero(change.kept_experiences[ids] != np.arange(self.n))
+        into = other.array("experience")
+        aliased = np.isin(into, gone)
+        keys = [
+            origin_key({name: rows.array(name) for name in ("session", "number")})
+            for rows in (own, other)
+        ]
+        plain = gone[~np.isin(keys[0][gone], keys[1])]  # an alias of itself has a turn
+        turned = np.zeros((int(aliased.sum()), 3))
+        turned[:, 2] = other.array("turn_rad")[aliased]
+        at = np.concatenate([table.array("experience"), into[aliased], plain])
+        pose = np.concatenate([table.array("pose"), turned, np.zeros((len(plain), 3))])
+        columns = {
+            name: np.concatenate(
+                [table.array(name), other.array(name)[aliased], own.array(name)[plain]]
+            )
+            for name in ("session", "number", "first_frame")
+        }
+        columns |= {"experience": ids[at], "pose": compose_poses(change.relative[at], pose)}
+        most = max(MOST_FORGOTTEN, 16 * self.config.max_experiences)
+        table.replace(**{name: torch.from_numpy(rows[-most:]) for name, rows in columns.items()})
+        stay = {name: torch.from_numpy(other.array(name)[~aliased]) for name in other.columns}
+        stay["experience"] = torch.from_numpy(ids[into[~aliased]])
+        other.replace(**stay)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Place the partial experiences in the loaded map and reroute their links."""

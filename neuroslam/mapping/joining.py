@@ -3,12 +3,13 @@
 import numpy as np
 import torch
 
-from neuroslam.geometry import TWO_PI, rotate, wrap_angle, wrap_angles
+from neuroslam.geometry import TWO_PI, rotate, rotate_points, wrap_angle, wrap_angles
 from neuroslam.mapping.tables import ALIAS_COLUMNS, Links, origin_key
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State, renamed
 from neuroslam.types import NO_TEMPLATE
 
+_GONE = ("session", "number", "first_frame", "experience")
 _PROVENANCE = ("first_frame", "session", "number")
 
 
@@ -51,7 +52,53 @@ def merge_maps(loaded: State, partial: State, join: Join) -> State:
     for name, value in (("dx_m", dx), ("dy_m", dy), ("facing_rad", facing)):
         merged[f"state.{name}"] = torch.tensor(value, dtype=torch.float64)
     merged["state.at_rest"] = torch.tensor(0)
-    return merged
+    return merged | _usage(known, old, join) | _forgotten(known, old, join)
+
+
+def _usage(
+    known: dict[str, np.ndarray], old: dict[str, np.ndarray], join: Join
+) -> dict[str, torch.Tensor]:
+    """Join the use of experiences: that of the loaded ones lies before the partial session."""
+    if "usage.at" not in old:
+        return {}
+    n, rows = join.n_experiences, {}
+    sizes = n, len(join.experiences)
+    for name in ("visits", "at", "near", "missed"):
+        column, before = old[f"usage.{name}"], known.get(f"usage.{name}", np.empty(0))
+        joined = np.zeros(n + len(join.kept_experiences), column.dtype)
+        joined[: min(sizes[0], len(before))] = before[: sizes[0]]
+        if name in ("at", "near"):
+            joined -= int(known["usage.at"].max(initial=0)) if "usage.at" in known else 0
+        ids = join.experiences[: len(column)]
+        combine = np.add if name == "visits" else np.maximum
+        combine.at(joined, ids, column)
+        rows[f"usage.{name}"] = torch.from_numpy(joined)
+    return rows
+
+
+def _forgotten(
+    known: dict[str, np.ndarray], old: dict[str, np.ndarray], join: Join
+) -> dict[str, torch.Tensor]:
+    """Join what both maps have forgotten: the rows of the partial one follow its experiences."""
+    if "forgotten.pose" not in old and "forgotten.pose" not in known:
+        return {}
+    tables = []
+    for state in (known, old):
+        table = {name: state.get(f"forgotten.{name}", np.empty(0, np.int64)) for name in _GONE}
+        table["pose"] = state.get("forgotten.pose", np.empty((0, 3)))
+        tables.append(table)
+    at, pose = tables[1]["experience"], tables[1]["pose"].copy()
+    turn = join.turns_rad[at]
+    pose[:, :2] = rotate_points(pose[:, :2], turn)
+    pose[:, 2] = wrap_angles(pose[:, 2] + turn)
+    tables[1] |= {"experience": join.experiences[at], "pose": pose}
+    fresh = ~np.isin(origin_key(tables[1]), origin_key(tables[0]))
+    return {
+        f"forgotten.{name}": torch.from_numpy(
+            np.concatenate([tables[0][name], tables[1][name][fresh]])
+        )
+        for name in (*_GONE, "pose")
+    }
 
 
 def _arrays(state: State) -> dict[str, np.ndarray]:

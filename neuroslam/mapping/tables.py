@@ -63,8 +63,10 @@ class Origins(NamedTuple):
         session: Session that made it.
         number: Number of experiences that this session had made before.
         first_frame: Frame that made it.
-        experience: Its id now, or that of the experience that it was merged into.
+        experience: Its id now, or that of the experience that it is part of.
         turn_rad: Its heading when it was made, minus the heading of ``experience``.
+        ahead_m: Its position in the frame of ``experience``; 0 for one that was merged.
+        left_m: And to the left.
     """
 
     session: np.ndarray
@@ -72,6 +74,8 @@ class Origins(NamedTuple):
     first_frame: np.ndarray
     experience: np.ndarray
     turn_rad: np.ndarray
+    ahead_m: np.ndarray
+    left_m: np.ndarray
 
 
 def origin_key(rows: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -154,8 +154,9 @@ def merge_states(
         one, other = part_of(loaded, name), part_of(partial, name)
         with torch.no_grad():
             result = part.merged(one, other, join)
-        if set(result) != set(other):
-            missing = sorted(set(result) ^ set(other))
+        # Tables that may be empty have no part in a state, and may be in one of the two alone.
+        missing = sorted((set(result) - set(one) - set(other)) | (set(other) - set(result)))
+        if missing:
             raise MapError(f"merge: {name} has no rule for {', '.join(missing)}; extend merged()")
         merged |= {f"{name}.{key}": value for key, value in result.items()}
     unmerged = sorted(key for key in partial if key not in merged and not key.startswith("stored."))

@@ -102,20 +102,21 @@ def experiences_of(
 
     Returns:
         Present id of the experience, ``(frames,)``, -1 where it is not on this map or there was
-        none yet; and the heading that the experience was created with minus the heading of the
-        experience that it has become, in radians, ``(frames,)``.
+        none yet; and the pose that the experience was created with, in the frame of the one that
+        it is part of now, ``(frames, 3)``.
     """
     origins = brain.map.origins()
     keys = origin_key(origins._asdict())
     own = origin_key({name: trace[name].astype(np.int64) for name in ("session", "number")})
-    experience, turn_rad = np.full(len(own), NO_EXPERIENCE), np.zeros(len(own))
+    experience, part_of = np.full(len(own), NO_EXPERIENCE), np.zeros((len(own), 3))
     if len(keys):
         order = np.argsort(keys)
         found = order[np.searchsorted(keys, own, sorter=order).clip(max=len(keys) - 1)]
         known = (keys[found] == own) & (trace["number"] >= 0)
         experience[known] = origins.experience[found[known]]
-        turn_rad[known] = origins.turn_rad[found[known]]
-    return experience, turn_rad
+        columns = origins.ahead_m, origins.left_m, origins.turn_rad
+        part_of[known] = np.column_stack(columns)[found[known]]
+    return experience, part_of
 
 
 def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarray:
@@ -127,11 +128,12 @@ def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarr
         x, y in metres and heading in radians, shape ``(frames, 3)``; NaN where the experience of
         the frame is on a stored map that was not joined.
     """
-    experience, turn_rad = experiences_of(brain, trace)
+    experience, part_of = experiences_of(brain, trace)
     on_map = experience >= 0
     at = np.full((len(experience), 3), np.nan)
     at[on_map] = brain.map.poses[experience[on_map]]
-    at[:, 2] += turn_rad
+    moved = part_of.any(axis=1)
+    at[moved] = compose_poses(at[moved], part_of[moved])
     if not brain.sessions.merges:
         at[trace["number"] < 0] = 0.0  # before the first experience
     return compose_poses(at, np.column_stack([trace[n] for n in ("dx_m", "dy_m", "dtheta_rad")]))

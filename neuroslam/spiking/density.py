@@ -14,6 +14,7 @@ from neuroslam.spiking.gaussian import Gaussian, fit_gaussian
 from neuroslam.spiking.space import SSPSpace
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State, merge_by_rules, summed
+from neuroslam.state.renumbering import Renumbering
 
 _POINTS = {1: 1001, 2: 81}  # a side of a grid, by the dimension
 _POINTS_IN_MORE = 25
@@ -465,6 +466,9 @@ class DensityEstimator(Mergeable):
     def gaussian(self) -> Gaussian:
         """Return the nearest normal distribution; see :func:`~.gaussian.fit_gaussian`."""
         return fit_gaussian(self.space, self.z)
+
+    def renumber(self, change: Renumbering) -> None:
+        """Do nothing: samples have no ids of the map."""
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Add the samples of two sessions, those of the partial one in the loaded frame.

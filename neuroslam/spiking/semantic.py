@@ -48,6 +48,7 @@ from neuroslam.state.population import (
     StepInput,
 )
 from neuroslam.state.registry import register
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.types import NO_TEMPLATE, Frame, Motion, Pose, PoseEstimate
 from neuroslam.worlds.landmarks import LandmarkView
 
@@ -618,6 +619,14 @@ class SemanticCells(Population):
         turn = -min(1.0, self.config.heading_rate_hz * dt_s) * float(off)
         self.now.heading_rad = wrap_angle(self.now.heading_rad + turn)
         return turn
+
+    def renumber(self, change: Renumbering) -> None:
+        """Follow the ids of the experiences that landmarks are anchored to."""
+        anchor = self.known["experience"].numpy()
+        rows = np.flatnonzero(anchor >= 0)
+        moved, offset = change.relative[anchor[rows]], self.known["offset_m"].numpy()
+        offset[rows] = from_frame(moved, offset[rows])
+        anchor[rows] = change.experiences[anchor[rows]]
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Merge the landmarks of two sessions; see :func:`~.semantic_joining.merge_landmarks`."""

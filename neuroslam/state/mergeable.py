@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from neuroslam.errors import MapError
 from neuroslam.state.join import Join
 from neuroslam.state.pickling import packed, unpacked
+from neuroslam.state.renumbering import Renumbering, summed_rows
 from neuroslam.threads import without_autocast
 
 P = ParamSpec("P")
@@ -167,9 +168,23 @@ class Mergeable(BufferModule, ABC):
             A state with the same names.
         """
 
+    def renumber(self, change: Renumbering) -> None:
+        """Follow a map that forgets experiences and templates.
+
+        Raises:
+            MapError: If the part cannot.
+        """
+        raise MapError(
+            f"{type(self).__name__} cannot follow a map that forgets: define renumber(), or set "
+            "map.max_experiences and map.consolidate_passes to 0"
+        )
+
 
 class AboutNow(Mergeable):
     """A part whose state is about the present alone: the session that goes on keeps its own."""
+
+    def renumber(self, change: Renumbering) -> None:
+        """Do nothing."""
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Return the partial one's state."""
@@ -322,3 +337,31 @@ def merge_by_rules(rules: Mapping[str, Rule], loaded: State, partial: State, joi
             raise MapError(f"merge: {name} has no rule; add it to merge_rules")
         merged[name] = rule(loaded[name], value, join)
     return merged
+
+
+def renumbered_by_rules(rules: Mapping[str, Rule], state: State, change: Renumbering) -> State:
+    """Return the tensors of a state that change when the map forgets, by their rules of merging.
+
+    Raises:
+        MapError: If a rule is not one of this module: which ids it reads is not known.
+    """
+    n_views, n = len(change.kept_views), len(change.kept_experiences)
+    by_rule: dict[Rule, Callable[[Tensor], Tensor] | None] = {
+        about_now: None,
+        summed: None,
+        rows_of_views: change.rows_of_views,
+        rows_of_experiences: change.rows_of_experiences,
+        summed_by_view: lambda column: summed_rows(column, change.views, n_views),
+        summed_by_experience: lambda column: summed_rows(column, change.experiences, n),
+        view_id: lambda number: renamed(number, change.views),
+        experience_id: lambda number: renamed(number, change.experiences),
+    }
+    changed: State = {}
+    for name, value in state.items():
+        rule = rule_of(name, rules)
+        if rule is None or rule not in by_rule:
+            raise MapError(f"{name}: its merge rule is not a standard one; define renumber()")
+        rows = by_rule[rule]
+        if rows is not None:
+            changed[name] = rows(value)
+    return changed

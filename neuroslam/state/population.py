@@ -17,7 +17,14 @@ from neuroslam.config import BrainConfig, Section
 from neuroslam.geometry import rotate
 from neuroslam.state.join import Join, MovedCells
 from neuroslam.state.match import Match
-from neuroslam.state.mergeable import Mergeable, Rule, State, merge_by_rules
+from neuroslam.state.mergeable import (
+    Mergeable,
+    Rule,
+    State,
+    merge_by_rules,
+    renumbered_by_rules,
+)
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.types import Frame, Motion, Pose, PoseEstimate, Tracking, ViewMatch
 
 Action = Literal["none", "create", "link", "set"]
@@ -303,6 +310,17 @@ class Population(Mergeable):
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Merge two states by :attr:`merge_rules`; a population with other needs overrides this."""
         return merge_by_rules(self.merge_rules, loaded, partial, join)
+
+    def renumber(self, change: Renumbering) -> None:
+        """Follow a map that forgets, by :attr:`merge_rules`; one with other needs overrides this.
+
+        Raises:
+            MapError: If a rule is not of :mod:`~neuroslam.state.mergeable`.
+        """
+        state = self.state_dict()
+        changed = renumbered_by_rules(self.merge_rules, state, change)
+        if changed:
+            self.load_state_dict(state | changed)
 
     def frames(self, loaded: State, partial: State, join: Join) -> tuple[Pose, Pose] | None:
         """Say how the frames lie in which two sessions keep positions, where it is not the map's.

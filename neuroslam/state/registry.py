@@ -212,3 +212,30 @@ def leading_class(config: BrainConfig) -> type[Population]:
             f"of {', '.join(can)}"
         )
     return leader
+
+
+def check_forgetting(config: BrainConfig) -> None:
+    """Refuse a config in which the map forgets, but a population cannot follow.
+
+    Raises:
+        ConfigError: If so.
+    """
+    if not (config.map.max_experiences or config.map.consolidate_passes):
+        return
+    what, leader = "map.max_experiences and map.consolidate_passes", leading_class(config)
+    if not leader.relaxes_map:
+        raise ConfigError(
+            f"{what} are for maps of views; here {leader.kind} leads, whose experiences are its "
+            "own cells; set both to 0, or add pose to cells"
+        )
+    if "semantic" in config.cells and "views" in config.semantic.landmarks:
+        raise ConfigError(
+            f"{what} cannot be used with views as landmarks; leave views out of semantic.landmarks"
+        )
+    for population in population_classes(config):
+        own = population.renumber is not Population.renumber
+        if not own and population.merged is not Population.merged:
+            raise ConfigError(
+                f"{what}: population {population.kind} merges in its own way; define renumber() "
+                "too, or set both to 0"
+            )

@@ -12,6 +12,7 @@ from torch import Tensor
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.pickling import Calls
+from neuroslam.state.renumbering import Renumbering
 
 ID_BITS = 40
 
@@ -107,6 +108,9 @@ class SessionLog(Mergeable):
             drive.add(session_name(session))
             session = before.get(session, 0)
         return drive
+
+    def renumber(self, change: Renumbering) -> None:
+        """Do nothing: the log has no ids of the map."""
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Keep the loaded sessions, then the partial ones that it does not have; so the merges."""

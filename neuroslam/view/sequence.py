@@ -21,6 +21,7 @@ from neuroslam.compiled import compiled, plain_array, runs_compiled
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE
 
@@ -271,6 +272,10 @@ class SequenceMatcher(Mergeable):
     def forget(self) -> None:
         """Clear the memory: the templates have changed, or the robot was kidnapped."""
         self.recent.replace(errors=self.recent["errors"][:0])
+
+    def renumber(self, change: Renumbering) -> None:
+        """Clear the memory: templates have other numbers."""
+        self.forget()
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Clear the memory: a merge renumbers templates."""

@@ -12,6 +12,7 @@ from neuroslam.errors import ConfigError, MapError
 from neuroslam.geometry import TWO_PI
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State, renamed
+from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_TEMPLATE, ViewMatch
 from neuroslam.view.features import Encoder, FeatureEncoder, view_encoder
@@ -328,6 +329,14 @@ class LocalViewCells(Mergeable):
         if self.config.mean_gate:
             columns["mean"][template] = view.mean() if self._exact else level / 255.0
         return template
+
+    def renumber(self, change: Renumbering) -> None:
+        """Drop the templates that are not kept."""
+        columns = {
+            name: change.rows_of_views(self.templates[name]) for name in self.templates.columns
+        }
+        self.templates.replace(**columns)
+        self.last.template = change.view(self.last.template)
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Append the partial session's unmatched templates to the loaded ones (Eq. 9)."""
