@@ -271,11 +271,19 @@ def experiences_csv(brain: NavigationBrain) -> str:
     return "\n".join(["id,x_m,y_m,theta_rad,template,first_frame", *lines]) + "\n"
 
 
-def links_csv(links: Links) -> str:
-    """Write the links as CSV: from,to,distance_m,heading_rad,facing_rad,duration_s."""
-    rows = zip(*(column.tolist() for column in links), strict=True)
-    lines = [",".join(repr(value) for value in row) for row in rows]
-    return "\n".join(["from,to,distance_m,heading_rad,facing_rad,duration_s", *lines]) + "\n"
+def links_csv(links: Links, weights: np.ndarray | None = None) -> str:
+    """Write the links as CSV: from,to,distance_m,heading_rad,facing_rad,duration_s,weight.
+
+    Args:
+        links: Links of the map.
+        weights: Their weights, as ``ExperienceMap.link_weights``; ``None``: without that column,
+            as it was before there were weights.
+    """
+    columns, header = [*links], "from,to,distance_m,heading_rad,facing_rad,duration_s"
+    if weights is not None:
+        columns, header = [*columns, weights], f"{header},weight"
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return "\n".join([header, *(",".join(map(repr, row)) for row in rows)]) + "\n"
 
 
 def write_text(path: Path, text: str) -> None:

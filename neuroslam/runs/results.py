@@ -179,7 +179,7 @@ def write_results(
             summary.accuracy["frames_with_truth"] = int(known.sum())
     staged = save.folder.staged
     write_text(staged / "experiences.csv", experiences_csv(brain))
-    write_text(staged / "links.csv", links_csv(brain.map.links))
+    write_text(staged / "links.csv", links_csv(brain.map.links, brain.map.link_weights))
     for name, table in tables.items():
         write_text(staged / name, table)
     write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))

@@ -379,7 +379,7 @@ def raise_x(lines):
 FOLDER_DAMAGE = {
     "places": (edit("experiences.csv", lambda lines: lines.pop()), "experiences.csv: "),
     "a digit": (edit("experiences.csv", raise_x), "experiences.csv: rows 3 differ from the brain"),
-    "links": (edit("links.csv", lambda lines: lines.append("0,0,0,0,0,0")), "links.csv: "),
+    "links": (edit("links.csv", lambda lines: lines.append("0,0,0,0,0,0,1")), "links.csv: "),
     "header": (edit("links.csv", lambda lines: lines.pop(0)), "links.csv: its columns are '0,1"),
     "text": (edit("links.csv", lambda lines: lines.append("a,b")), "links.csv: cannot be read"),
     "no file": (lambda out: (out / "links.csv").unlink(), "links.csv: cannot be read (No such"),

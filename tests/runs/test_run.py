@@ -94,7 +94,9 @@ def test_the_columns_are_a_contract(whole):
         "x_m,y_m,theta_rad,pose_x,pose_y,pose_theta,n_templates,n_experiences,n_links"
     )
     assert table(out / "experiences.csv")[0] == "id,x_m,y_m,theta_rad,template,first_frame"
-    assert table(out / "links.csv")[0] == "from,to,distance_m,heading_rad,facing_rad,duration_s"
+    assert table(out / "links.csv")[0] == (
+        "from,to,distance_m,heading_rad,facing_rad,duration_s,weight"
+    )
 
 
 def test_every_frame_has_a_row_that_says_what_the_brain_said(whole):
@@ -125,7 +127,11 @@ def test_the_tables_hold_the_map_to_the_last_digit(whole):
     np.testing.assert_array_equal(rows[:, 1:4], brain.map.poses)
     np.testing.assert_array_equal(rows[:, 0], np.arange(brain.map.n))
     links = np.loadtxt(out / "links.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(links, np.column_stack(brain.map.links))
+    np.testing.assert_array_equal(links[:, :6], np.column_stack(brain.map.links))
+    np.testing.assert_array_equal(links[:, 6], brain.map.link_weights)
+    assert (links[:, 6] > 0.0).all()
+    assert (links[:, 6] <= 1.0).all()
+    assert links[0, 6] == 1.0
 
 
 def test_the_metrics_say_how_much_how_fast_and_how_well(whole):
