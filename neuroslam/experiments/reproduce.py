@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -114,10 +115,18 @@ def _line(
     name = claim.experiment
     if name not in results:
         return Line(claim, None, None, notes[name])
-    if size == "quick" and claim.only_full:
-        return Line(claim, None, seconds[name], "needs the full size")
     value = claim.value(results[name])
-    return Line(claim, value, seconds[name], "" if value is not None else "no such row")
+    if value is not None:
+        return Line(claim, value, seconds[name])
+    late = size == "quick" and claim.only_full
+    return Line(claim, None, seconds[name], "needs the full size" if late else "no such row")
+
+
+def _met(line: Line, size: Size) -> bool | None:
+    """Tell whether a line meets its target; ``None``: it has no value, or not of that size."""
+    if line.value is None or (size == "quick" and line.claim.only_full):
+        return None
+    return line.claim.met(line.value)
 
 
 def _rows(lines: Sequence[Line], size: Size) -> list[dict[str, Any]]:
@@ -130,8 +139,8 @@ def _rows(lines: Sequence[Line], size: Size) -> list[dict[str, Any]]:
             "size": size,
             "printed": line.claim.printed,
             "target": None if line.claim.target() is None else _target(line.claim),
-            "ours": line.value,
-            "met": None if line.value is None else line.claim.met(line.value),
+            "ours": line.value if line.value is None or isfinite(line.value) else str(line.value),
+            "met": _met(line, size),
             "stored": line.claim.stored(size),
             "as_stored": None if line.value is None else line.claim.same(line.value, size),
             "seconds": line.seconds,
@@ -151,17 +160,23 @@ def _target(claim: Claim) -> str:
 
 def page(lines: Sequence[Line], size: Size) -> str:
     """Return the page as Markdown: a table for each paper, and counts of what is met."""
-    met = [line.claim.met(line.value) for line in lines if line.value is not None]
+    met = [_met(line, size) for line in lines]
+    full = [
+        line.claim.met(line.claim.full)
+        for line, is_met in zip(lines, met, strict=True)
+        if is_met is None and line.claim.full is not None
+    ]
     same = [line.claim.same(line.value, size) for line in lines if line.value is not None]
     text = [
         f"# Reproduction, {size} size",
         "",
         f"{len(lines)} values of the papers: {met.count(True)} met, {met.count(False)} not met, "
-        f"{sum(line.value is None for line in lines)} not measured here. Of those with a stored "
-        f"value of this size {same.count(True)} are as stored, {same.count(False)} are not.",
+        f"{met.count(None)} not decided here; of these, by stored values of the full size, "
+        f"{full.count(True)} are met and {full.count(False)} are not. Of values with a stored one "
+        f"of this size {same.count(True)} are as stored, {same.count(False)} are not.",
         "",
         "`target` is the printed value, or ours where the paper prints none or its recording is "
-        "not public. `seconds` is the wall time of the whole experiment.",
+        "not public. `s` is the wall time of the whole experiment.",
     ]
     for paper, title in PAPERS.items():
         text += ["", f"## {title}", ""]
@@ -178,10 +193,10 @@ def page(lines: Sequence[Line], size: Size) -> str:
 
 def _markdown(line: Line, size: Size) -> str:
     claim, value = line.claim, line.value
-    if value is None:
-        ours, met = line.note, "-"
-    else:
-        ours, met = f"{value:.4g}", {True: "yes", False: "**no**", None: "-"}[claim.met(value)]
+    words = {True: "yes", False: "**no**", None: "-"}
+    ours, met = f"{value:.4g}" if value is not None else line.note, words[_met(line, size)]
+    if _met(line, size) is None and claim.full is not None:
+        met = f"{words[claim.met(claim.full)]}, full size: {claim.full:g}"
     stored = claim.stored(size)
     kept = "-" if stored is None else f"{stored:g}"
     if value is not None and claim.same(value, size) is False:

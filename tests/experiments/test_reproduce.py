@@ -83,7 +83,9 @@ def test_an_interrupted_call_continues_and_sizes_are_not_mixed(tmp_path):
     assert ("ssp-3d", QUICK["ssp-3d"]) in ran
     notes = {line.claim.experiment: line.note for line in quick}
     assert notes["campus"] == "left out of the quick size"
-    assert notes["threshold-sweep"] == "needs the full size"
+    sweep = next(line for line in quick if line.claim.experiment == "threshold-sweep")
+    assert sweep.value == 0.04  # shown, but an error of two minutes decides nothing
+    assert "| 0.04 | **no**, full size: 0.04 |" in (tmp_path / "quick/reproduction.md").read_text()
 
 
 def test_an_unknown_experiment_is_refused(tmp_path):
