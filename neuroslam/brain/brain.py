@@ -310,6 +310,9 @@ class NavigationBrain(BrainState):
         if not self.clock.frames_seen:
             return 1.0 / self.config.frame_rate_hz
         dt_s = frame.time_s - self.clock.time_s
+        begins = bool(self.sessions.sessions) and not self.sessions.now.frames
+        if begins and not 0.0 < dt_s <= self.config.max_gap_s:
+            return 1.0 / self.config.frame_rate_hz  # start_new_map: any time may have passed
         if not dt_s > 0.0:  # NaN too
             raise BadFrame(
                 f"time {float(frame.time_s)} s does not follow {self.clock.time_s} s "

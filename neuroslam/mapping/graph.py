@@ -190,18 +190,19 @@ class ExperienceGraph(Mergeable):
         """Return the shortest-path length from ``start`` to every experience, metres, ``(n,)``."""
         return shortest_path_lengths(self.links, self.n, start)
 
-    def plan(self, goal: int, start: int | None = None) -> Plan:
-        """Find the quickest path to an experience by link durations; links work in both directions.
+    def plan(self, goal: int, start: int | None = None, forward: bool = False) -> Plan:
+        """Find the quickest path to an experience by link durations.
 
         Args:
             goal: Id to reach.
             start: Id to start from; the current one if not given.
+            forward: Follow links only in the direction in which they were driven.
 
         Returns:
             The path, or an empty one with the reason.
         """
         start = self.state.current if start is None else start
-        return quickest_path(self.links, self.n, start, goal)
+        return quickest_path(self.links, self.n, start, goal, forward)
 
     @property
     def origin(self) -> tuple[int, int]:

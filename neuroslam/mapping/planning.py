@@ -22,8 +22,10 @@ class Plan(NamedTuple):
     reason: str = ""
 
 
-def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) -> Plan:
-    """Find the quickest path by link time, links in both directions (Dijkstra).
+def quickest_path(
+    links: tuple[np.ndarray, ...], n: int, start: int, goal: int, forward: bool = False
+) -> Plan:
+    """Find the quickest path by link time (Dijkstra).
 
     Args:
         links: ``source``, ``target``, ..., ``duration_s`` last, as in
@@ -31,6 +33,7 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
         n: Number of experiences.
         start: Id to start from.
         goal: Id to reach.
+        forward: Follow links from source to target only; default: in both directions.
 
     Returns:
         The plan; of an unreachable goal it has the ``reason``, and nothing is raised.
@@ -45,7 +48,7 @@ def quickest_path(links: tuple[np.ndarray, ...], n: int, start: int, goal: int) 
             return Plan([], np.inf, f"{name} {experience} is not in a map of {n} experiences")
     from scipy.sparse.csgraph import dijkstra  # slow to import, not always needed
 
-    graph = _graph(links[0], links[1], links[-1], n)
+    graph = _graph(links[0], links[1], links[-1], n, forward)
     distance, before = dijkstra(graph, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
         return Plan([], np.inf, f"no links lead from experience {start} to {goal}")
@@ -78,12 +81,52 @@ def shortest_path_lengths(links: tuple[np.ndarray, ...], n: int, start: int) -> 
     return lengths
 
 
-def _graph(source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int) -> "csr_array":
-    """Return links in both directions; weights are above 0, as csgraph reads 0 as no edge."""
+def leads_to(links: tuple[np.ndarray, ...], n: int, goal: int) -> np.ndarray:
+    """Return which experiences lead to a goal along links from source to target, ``(n,)`` bool.
+
+    Args:
+        links: As for :func:`quickest_path`.
+        n: Number of experiences.
+        goal: Id to reach.
+
+    Example:
+        >>> links = (np.array([0, 1]), np.array([1, 2]), np.array([5.0, 1.0]))
+        >>> leads_to(links, 3, 1).tolist()
+        [True, True, False]
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    graph = _graph(links[1], links[0], links[-1], n, forward=True)
+    return np.asarray(np.isfinite(dijkstra(graph, indices=goal)))
+
+
+def on_loops(links: tuple[np.ndarray, ...], n: int) -> np.ndarray:
+    """Return the experiences of the largest part in which each leads to each other, ascending.
+
+    Args:
+        links: As for :func:`quickest_path`; followed from source to target.
+        n: Number of experiences.
+
+    Example:
+        >>> on_loops((np.array([0, 1, 2]), np.array([1, 2, 1]), np.ones(3)), 3).tolist()
+        [1, 2]
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    graph = _graph(links[0], links[1], links[-1], n, forward=True)
+    part = connected_components(graph, connection="strong")[1]
+    return np.flatnonzero(part == np.bincount(part).argmax())
+
+
+def _graph(
+    source: np.ndarray, target: np.ndarray, weight: np.ndarray, n: int, forward: bool = False
+) -> "csr_array":
+    """Return the graph of links; weights are above 0, as csgraph reads 0 as no edge."""
     from scipy.sparse import coo_array
 
-    pairs = np.concatenate([source * n + target, target * n + source])
-    weights = np.maximum(np.concatenate([weight, weight]), 1e-9)
+    both = [source * n + target, target * n + source]
+    pairs = both[0] if forward else np.concatenate(both)
+    weights = np.maximum(weight if forward else np.concatenate([weight, weight]), 1e-9)
     order = np.lexsort((weights, pairs))  # coo sums duplicates: keep the least of each pair
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(pairs[order]) != 0
