@@ -18,7 +18,7 @@ from benchmarks.timing import Row, written, yardstick_ms
 
 MODULES = (
     "pose_cells", "view_search", "relaxation", "pose_graph", "merge", "arena", "navigation", "ssp",
-    "batches", "end_to_end",
+    "batches", "end_to_end", "compilation",
 )  # fmt: skip
 LAST = Path(__file__).with_name("last.json")
 LOSS = 1.15

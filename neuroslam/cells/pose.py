@@ -59,14 +59,18 @@ class _Now:
     slip: list[float] | Tensor  # lag of the estimate behind odometry in cells: x, y, theta
     estimate: PoseEstimate | Tensor | None = None  # of the packet, once it was decoded
     injected: bool = False  # since the last step
+    flat: tuple[Packet, np.ndarray, Cell] | None = None  # a packet, as compiled steps gave it
 
 
 def _no_slip(like: Tensor) -> list[float] | Tensor:
     return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
 
 
-def _flat(packet: Packet) -> tuple[np.ndarray, Cell, Cell, Cell]:
+def _flat(now: _Now) -> tuple[np.ndarray, Cell, Cell, Cell]:
     """Return values, sizes, origin and torus for a compiled step."""
+    packet = now.packet
+    if now.flat is not None and now.flat[0] is packet:
+        return now.flat[1], now.flat[2], cast(Cell, packet.origin), packet.shape
     values = packet.values.numpy()
     a, b, c = values.shape
     flat = values.reshape(-1).astype(np.float64)
@@ -195,7 +199,7 @@ class PoseCellNetwork(Population):
             return decode_all(packet, radius)
         if not runs_compiled(packet.values):
             return decode(packet, radius)
-        return PoseEstimate(*decode_window(*_flat(packet), radius))
+        return PoseEstimate(*decode_window(*_flat(self._now), radius))
 
     @property
     def peak(self) -> float:
@@ -216,7 +220,7 @@ class PoseCellNetwork(Population):
         turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
         follows = c.exact_gain and not now.injected
         if not follows:
-            now.slip = _no_slip(self.slip)
+            now.slip = [0.0, 0.0, 0.0] if self.batch is None else _no_slip(self.slip)
             now.injected = False
         before = self.estimate if follows else None
         if self.batch is None:
@@ -243,12 +247,13 @@ class PoseCellNetwork(Population):
             self._loops = (*kernels, heading_table(c.n_theta))
         excite, inhibit, headings = self._loops
         moved, sizes, origin, estimate = advance(
-            *_flat(now.packet), excite, inhibit, c.global_inhibition, distance, turn + theta,
+            *_flat(now), excite, inhibit, c.global_inhibition, distance, turn + theta,
             (x, y), headings, c.decode_radius, c.precision == "float32",
         )  # fmt: skip
         if not moved.size:
             raise silenced(c.global_inhibition)
-        now.packet = _window(moved, sizes, origin, now.packet)
+        now.packet = packet = _window(moved, sizes, origin, now.packet)
+        now.flat = packet, moved, sizes
         now.estimate = PoseEstimate(*estimate)
 
     def _settled(self) -> Packet:
@@ -365,7 +370,7 @@ class PoseCellNetwork(Population):
         packet = self.packet
         if runs_compiled(packet.values):
             where = (float(at.theta), float(at.y), float(at.x))
-            self.packet = _window(*inject_window(*_flat(packet), where, energy), packet)
+            self.packet = _window(*inject_window(*_flat(self._now), where, energy), packet)
         else:
             self.packet = inject(packet, at, energy)
         self._now.injected = True

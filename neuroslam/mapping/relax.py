@@ -70,6 +70,14 @@ def _differ(a: float, b: float) -> bool:
 
 
 @compiled
+def _copy(into: np.ndarray, values: np.ndarray) -> None:
+    """Copy poses; an assignment of slices would take three seconds to compile."""
+    for i in range(values.shape[0]):
+        for axis in range(values.shape[1]):
+            into[i, axis] = values[i, axis]
+
+
+@compiled
 def _turned(turn: float) -> float:
     """Wrap an angle; rarely anything to do, and then a division."""
     if not -math.pi <= turn < math.pi:
@@ -241,8 +249,8 @@ def relax(
             changed_at[0, i] = counts[0]
         if _differ(pose[i, 2], poses[i, 2]):
             changed_at[1, i] = counts[0]
-    pose[:] = poses
-    before = np.empty_like(pose)
+    before = np.empty(pose.shape)
+    _copy(pose, poses)
     while loop < loops:
         left = (loops - 1 - loop) % CHECK_EVERY  # loops until the next that is checked
         if left > 0 and counts[1] > 2 * DENSE * n_links:
@@ -253,7 +261,7 @@ def relax(
             loop += left
             left = 0
         if left == 0:
-            before[:] = pose
+            _copy(before, pose)
         counts[1] = _tracked_loop(
             pose, changed_at, along, counts[0],
             source, target, distance_m, heading_rad, facing_rad, correction,
