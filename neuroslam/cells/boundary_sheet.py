@@ -29,6 +29,13 @@ _WINDOW = 5  # cells on either side that the population vector takes
 _SIDE_M = 0.2  # of a wall on either side of its foot, whose beams a cell takes
 _MOST_RAD = math.radians(75.0)  # angle to them at most
 _RINGS = (True, False)  # bearing, distance
+_REFINES = 4  # rounds of the fit to the beams of a wall
+_WITHIN = 3.0  # residual, in widths of the tuning, above which a beam is of another wall
+_FEWEST = 8  # beams of such a fit
+_LEAST_BEND = 0.2  # 1 minus distance over radius, below which the foot is not sure
+_APART_RAD = math.radians(25.0)  # bearing within which two feet at one distance are one
+_MOST_TURN_RAD, _BEND_PER_M = math.radians(15.0), 2.0  # largest turn, sd of the curvature
+_BEAM_M = 0.03  # residual at which a beam weighs as much as that sd
 
 
 def warp(distance_m: Tensor, beta_m: float) -> Tensor:
@@ -467,9 +474,88 @@ class BoundarySheet(nn.Module):
     def walls_in_scan(self, ranges: np.ndarray) -> np.ndarray:
         """Read the walls of a scan: distance (m) and bearing relative to the heading, ``(n, 2)``.
 
+        Cells are tuned to straight walls, so a concave one reads too near, the more the farther it
+        is, and around the middle of a round room a wall has several maxima. Each is therefore
+        refined by its beams (:func:`foot_of_beams`); what is no foot, or a foot twice, is left out.
+
         Raises:
             BadFrame: If the ranges are invalid.
         """
         with torch.inference_mode():
             distance, bearing, _ = self.read(self.respond_to_scan(ranges), self.clear_scan)
-        return torch.stack([distance, bearing], dim=1).numpy()
+        walls = torch.stack([distance, bearing], dim=1).numpy()
+        ranges = checked_ranges(ranges)
+        widths_m = self.config.sigma_m * (walls[:, 0] / self.config.beta_m + 1.0)
+        found: list[tuple[float, float]] = []
+        for wall, width_m in zip(walls, widths_m, strict=True):
+            foot = foot_of_beams(ranges, float(wall[0]), float(wall[1]), float(width_m))
+            if foot is not None and not any(_same_foot(foot, one, width_m) for one in found):
+                found.append(foot)
+        return np.array(sorted(found)).reshape(-1, 2)
+
+
+def _same_foot(one: tuple[float, float], other: tuple[float, float], width_m: float) -> bool:
+    turn = (one[1] - other[1] + math.pi) % TWO_PI - math.pi
+    return abs(turn) < _APART_RAD and abs(one[0] - other[0]) < width_m
+
+
+def foot_of_beams(
+    ranges: np.ndarray, distance_m: float, bearing_rad: float, width_m: float
+) -> tuple[float, float] | None:
+    r"""Refine distance and bearing of the foot of a wall by a parabola through its beams.
+
+    .. math:: p_i = r_i \cos \Delta_i, \qquad p \approx a + s t + \tfrac{1}{2} k t^2, \qquad
+              t_i = \hat p_i \tan \Delta_i
+
+    with :math:`\Delta` the angle from the bearing that was read. The foot is the nearest point of
+    the parabola, :math:`t = -a s / (1 + s^2 + a k)`. Beams weigh by Tukey's biweight, for outliers,
+    and by :math:`1 / \cos^2 \Delta`, for the noise of :math:`p`.
+
+    Args:
+        ranges: Ranges, ``(n,)``; ``inf`` for none.
+        distance_m: Distance that was read.
+        bearing_rad: Bearing that was read.
+        width_m: Width of the tuning at that distance.
+
+    Returns:
+        Distance and bearing; those that were read if too few beams are of that wall; ``None`` if
+        the foot lies elsewhere, so that none was read.
+
+    Example:
+        A wall at 0.25 m, from within a circle of radius 0.5 m:
+
+        >>> angle = TWO_PI * np.arange(180) / 180
+        >>> to_middle = -0.25 * np.cos(angle)
+        >>> ranges = to_middle + np.sqrt(to_middle**2 + 0.5**2 - 0.25**2)
+        >>> [round(x, 2) for x in foot_of_beams(ranges, 0.24, 0.03, 0.06)]
+        [0.25, 0.0]
+    """
+    angle = (TWO_PI / len(ranges)) * np.arange(len(ranges)) - bearing_rad
+    angle = (angle + math.pi) % TWO_PI - math.pi
+    side_rad = min(math.atan2(_SIDE_M, distance_m), _MOST_RAD)
+    near = (np.abs(angle) <= side_rad) & (ranges < math.inf)
+    angle = angle[near]
+    cosine, tangent = np.cos(angle), np.tan(angle)
+    across = ranges[near] * cosine
+    prior = np.diag([0.0, 0.0, (_BEAM_M / _BEND_PER_M) ** 2])
+    fit, fitted = np.array([distance_m, 0.0, 0.0]), np.full(len(angle), distance_m)
+    for _ in range(_REFINES):
+        # The noise of a range is not in t, else noise would bend the parabola.
+        along = fitted * tangent
+        terms = np.stack([np.ones_like(along), along, 0.5 * along * along])
+        off = (across - fitted) / (_WITHIN * width_m)
+        weight = np.where(np.abs(off) < 1.0, (1.0 - off * off) ** 2, 0.0) / (cosine * cosine)
+        if (weight > 0.0).sum() < _FEWEST:
+            return distance_m, bearing_rad
+        weighted = terms * weight
+        fit = np.linalg.solve(weighted @ terms.T + prior, weighted @ across)
+        fitted = fit @ terms
+    a, s, k = fit
+    if not (a > 0.0 and 1.0 + s * s + a * k > _LEAST_BEND):
+        return distance_m, bearing_rad
+    t = -a * s / (1.0 + s * s + a * k)
+    p = a + s * t + 0.5 * k * t * t
+    turn, foot_m = math.atan2(t, p), math.hypot(t, p)
+    if abs(turn) > _MOST_TURN_RAD or abs(foot_m - distance_m) > width_m:
+        return None
+    return foot_m, (bearing_rad + turn) % TWO_PI

@@ -19,6 +19,8 @@ class Wall(NamedTuple):
         distance_m: Distance of the wall from the anchor.
         variance_m2: Variance of that distance.
         made_s: Time at which it was first sensed, since the session began.
+        due: Comparisons in its first minute at which it should have been sensed.
+        met: Those at which it was.
     """
 
     x_m: Tensor
@@ -27,6 +29,8 @@ class Wall(NamedTuple):
     distance_m: Tensor
     variance_m2: Tensor
     made_s: Tensor
+    due: Tensor
+    met: Tensor
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -73,7 +77,7 @@ def squared_mismatch(
     .. math:: \frac{|x_m - x|^2}{s^2} + \frac{(\alpha_m - \alpha)^2}{a^2}
 
     Args:
-        walls: Rows as in :class:`Wall`, ``(..., 5)``.
+        walls: Rows as in :class:`Wall`, ``(..., 8)``.
         position_m: :math:`x`, ``(..., 2)``.
         bearing_rad: :math:`\alpha`, ``(...)``.
         scale: :math:`s` in metres, :math:`a` in radians.

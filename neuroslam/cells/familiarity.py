@@ -20,6 +20,7 @@ _SLACK_BINS = 2  # tolerance of bearing, in boundary cells
 _FAMILIAR_S = 1.0
 _MOST = 5.0  # largest doubt, as a multiple of that of a lost animal
 _FORGIVES = 0.15  # weight of agreement against that of contradiction
+_DOUBTFUL = 0.5  # contradiction from which on walls are not learnt
 
 
 class Felt(NamedTuple):
@@ -54,7 +55,7 @@ def felt_walls(distance_m: Tensor, bearing_rad: Tensor, reach_m: float, n_bearin
 @compiled
 def compare_step(
     winner: int, distance_m: np.ndarray, bearing_rad: np.ndarray, error_rad: float,
-    against: bool, supports: bool, dt_s: float, reach_m: float, lost_after_s: float,
+    against: float, supports: bool, dt_s: float, reach_m: float, lost_after_s: float,
     felt_s: np.ndarray, time_s: np.ndarray, doubt_s: np.ndarray, lost: np.ndarray,
     slack: np.ndarray,
 ) -> None:  # fmt: skip
@@ -82,14 +83,13 @@ def compare_step(
         differs |= felt[1, i] > 0.0 and ever < np.float32(_NEVER)
         always = felt_s[0, cell, 1, i] / total
         differs |= always > np.float32(_ALWAYS) and around == 0.0
-    contradicted = against or (differs and time > np.float32(_FAMILIAR_S) and winner >= 0)
-    agrees = supports and not contradicted
-    doubt = doubt_s[0] + np.float32(dt_s) * (
-        np.float32(contradicted) - np.float32(_FORGIVES) * np.float32(agrees)
-    )
+    differs &= time > np.float32(_FAMILIAR_S) and winner >= 0
+    contradicted = np.float32(max(against, 1.0 if differs else 0.0))
+    agrees = (np.float32(1.0) - contradicted) * np.float32(supports)
+    doubt = doubt_s[0] + np.float32(dt_s) * (contradicted - np.float32(_FORGIVES) * agrees)
     doubt_s[0] = min(max(doubt, np.float32(0.0)), np.float32(_MOST * lost_after_s))
     lost[0] = doubt_s[0] > (0.0 if lost[0] else np.float32(lost_after_s))
-    if winner >= 0 and not contradicted and not lost[0]:
+    if winner >= 0 and contradicted < np.float32(_DOUBTFUL) and not lost[0]:
         time_s[0, cell] += np.float32(dt_s)
         for side in range(2):
             for k in range(n):
@@ -100,7 +100,8 @@ class Familiarity(BufferModule):
     r"""Learns which walls are sensed at each place cell, and detects contradictions.
 
     Walls contradict if one is near where none ever was, or missing where one always was, or not
-    where it was remembered: the doubt ``doubt_s`` grows by the time. It decreases, more slowly,
+    where it was remembered: the doubt ``doubt_s`` grows by the time, times the weight of a wall's
+    absence (:func:`~neuroslam.cells.walls.absence_weight`). It decreases, more slowly,
     while a wall known for long is where it should be, for many walls fit by chance. Without known
     or sensed walls it stays. An animal is ``lost`` from when its doubt exceeds ``lost_after_s``
     until it is 0. State: seconds of each place cell with each bearing (``felt_s``) and in all
@@ -165,16 +166,17 @@ class Familiarity(BufferModule):
         missing = ((always > _ALWAYS) * ((felt.any @ self.slack) == 0)).amax(-1)
         known = (time > _FAMILIAR_S) & (winner >= 0)
         against, supports = evidence
-        contradicted = against | ((torch.maximum(new, missing) > 0) & known)
-        agrees = supports & ~contradicted
-        doubt = self.doubt_s + dt_s * (contradicted.to(time) - _FORGIVES * agrees.to(time))
+        differs = (torch.maximum(new, missing) > 0) & known
+        contradicted = torch.maximum(against.to(time), differs.to(time))
+        agrees = (1.0 - contradicted) * supports.to(time)
+        doubt = self.doubt_s + dt_s * (contradicted - _FORGIVES * agrees)
         self.doubt_s = doubt.clamp(0.0, _MOST * self.lost_after_s)
         self.lost = torch.where(
             self.lost,
             self.doubt_s > 0.0,
             self.doubt_s > self.lost_after_s,
         )
-        sure = (~contradicted & (winner >= 0) & ~self.lost).to(time) * dt_s
+        sure = ((contradicted < _DOUBTFUL) & (winner >= 0) & ~self.lost).to(time) * dt_s
         self.time_s[rows, cell] = time + sure
         self.felt_s[rows, cell] += torch.stack(felt, dim=1) * sure[:, None, None]
         return self.lost
@@ -186,11 +188,11 @@ class Familiarity(BufferModule):
 
     def compare_compiled(
         self, winner: int, distance_m: np.ndarray, bearing_rad: np.ndarray, error_rad: float,
-        evidence: Sequence[bool], dt_s: float,
+        evidence: Sequence[float], dt_s: float,
     ) -> None:  # fmt: skip
         """Do as :meth:`forward` for one animal, by bearings not less the compass error."""
         self._make_room(winner)
-        against, supports = evidence
+        against, supports = float(evidence[0]), bool(evidence[1])
         compare_step(
             winner, distance_m, bearing_rad, error_rad, against, supports, dt_s,
             self.config.reach_m, self.lost_after_s, *cast(Arrays, self.arrays()),

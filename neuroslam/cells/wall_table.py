@@ -18,6 +18,8 @@ ACTIVE = 96
 UNKNOWN_M2 = 1.0
 """Variance of a distance before it was measured."""
 
+_COLUMNS_BEFORE = 6  # of walls in brains that were saved without ``due`` and ``met``
+
 
 class Since(Scalars):
     """Time since the last correction by walls (``s``), and since the session began (``time_s``)."""
@@ -96,7 +98,7 @@ class WallTable(BufferModule):
                     continue
                 wall = n
                 new = [*position[row], bearing[row], distance[row]]
-                rest = position.new_tensor([UNKNOWN_M2, self.since.time_s])
+                rest = position.new_tensor([UNKNOWN_M2, self.since.time_s, 0.0, 0.0])
                 self._remember(row, torch.cat([torch.stack(new), rest]))
             slot[row], known[row] = self._activate(row, wall, position[row]), True
         return slot, known
@@ -155,6 +157,11 @@ class WallTable(BufferModule):
 def _take_sizes(
     module: torch.nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
 ) -> None:
+    walls = state.get(prefix + "walls")
+    if walls is not None and walls.dim() == 3 and walls.shape[-1] == _COLUMNS_BEFORE:
+        state[prefix + "walls"] = torch.nn.functional.pad(
+            walls, (0, len(Wall._fields) - _COLUMNS_BEFORE)
+        )
     for name in ("walls", "active", "covariance"):
         saved = state.get(prefix + name)
         if saved is not None and len(saved) == len(getattr(module, name)):

@@ -26,6 +26,9 @@ SAMPLE_S = 0.05
 """Correlation time of random errors of speed and heading, whatever the frame rate."""
 
 _OLD_S = 60.0  # only memories older than this tell whether the animal is lost
+_CHANCE = 0.565  # share of the walls sensed where they are that a lost animal meets by chance
+_SURELY = 0.99  # largest probability of detection that is assumed
+_PRIOR, _ALL_PRIOR = 2.0, 4.0  # comparisons that the shares of a wall and of all begin with
 _ABREAST = 0.2  # share of a segment within which the wall must still be sensed
 _ALIKE_RAD = math.radians(25.0)
 
@@ -33,6 +36,34 @@ _ALIKE_RAD = math.radians(25.0)
 _SHARE, _ADDED, _SLOW_S, _SLOW_RAD2, _SIGMA2, _SIGMA_RAD, _GATE2, _WIDTH2, _FOUR_SPREADS = range(9)
 _UNKNOWN_M2 = wall_table.UNKNOWN_M2
 _DONE, _NEEDS_ROW, _NEEDS_SLOT = -1, 0, 1  # of :func:`correct_step`
+
+
+@compiled
+def absence_weight(due: float, met: float, all_due: float, all_met: float) -> float:
+    r"""Return how strongly the absence of a wall contradicts the position, 0 to 1.
+
+    .. math:: w = \frac{\Lambda(h)}{\Lambda(0.99)}, \qquad
+              \Lambda(h) = \ln \frac{1 - c h}{1 - h}, \qquad h = \frac{m + 2 g}{n + 2}
+
+    the log-likelihood ratio of not sensing the wall: a lost animal senses it with probability
+    :math:`c h`, by chance, one that is not lost with :math:`h`. That was learnt in the first minute
+    of the wall, in which drift is small: :math:`m` of :math:`n` comparisons, and :math:`g` of all
+    walls. A wall that was read wrongly from one noisy scan is never sensed again, and says nothing.
+
+    Args:
+        due: :math:`n`, comparisons at which the wall should have been sensed.
+        met: :math:`m`, those at which it was.
+        all_due: The same of all walls.
+        all_met: The same of all walls.
+
+    Example:
+        >>> absence_weight(8, 8, 100, 100), round(absence_weight(4, 0, 100, 80), 3)
+        (1.0, 0.039)
+    """
+    of_all = (all_met + _ALL_PRIOR) / (all_due + _ALL_PRIOR)
+    share = min((met + _PRIOR * of_all) / (due + _PRIOR), _SURELY)
+    most = math.log((1.0 - _CHANCE * _SURELY) / (1.0 - _SURELY))
+    return math.log((1.0 - _CHANCE * share) / (1.0 - share)) / most
 
 
 @compiled
@@ -139,6 +170,7 @@ def _recalled(
         walls[0, wall, 0], walls[0, wall, 1] = x_m, y_m
         walls[0, wall, 2], walls[0, wall, 3] = bearing_rad, distance_m
         walls[0, wall, 4], walls[0, wall, 5] = _UNKNOWN_M2, time_s
+        walls[0, wall, 6] = walls[0, wall, 7] = 0.0
         n_walls[0] = n + 1
     if free < 0:
         farthest = -1.0
@@ -251,14 +283,18 @@ def correct_step(
 @compiled
 def evidence_step(
     position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray, sure_m: float,
-    time_s: float, walls: np.ndarray, active: np.ndarray, scale: np.ndarray,
+    time_s: float, walls: np.ndarray, n_walls: np.ndarray, active: np.ndarray, scale: np.ndarray,
     rejected: np.ndarray, accepted: np.ndarray, errors: np.ndarray,
-) -> tuple[bool, bool]:  # fmt: skip
+) -> tuple[float, bool]:  # fmt: skip
     """Do as :meth:`WallMemory.evidence` for one animal; bearings have the compass error yet."""
-    against = rejected[0]
+    against = 1.0 if rejected[0] else 0.0
+    all_due = all_met = 0.0
+    for k in range(n_walls[0]):
+        all_due += walls[0, k, 6]
+        all_met += walls[0, k, 7]
     for slot in range(active.shape[1]):
         k = active[0, slot]
-        if k < 0 or not time_s - walls[0, k, 5] > _OLD_S:
+        if k < 0:
             continue
         dx, dy = walls[0, k, 0] - position_m[0], walls[0, k, 1] - position_m[1]
         nx, ny = math.cos(walls[0, k, 2]), math.sin(walls[0, k, 2])
@@ -269,9 +305,13 @@ def evidence_step(
         for w in range(distance_m.shape[0]):
             turn = _wrapped(bearing_rad[w] - errors[0, 1] - walls[0, k, 2])
             met |= abs(turn) < _ALIKE_RAD and abs(distance_m[w] - expected) < 0.5 * sure_m
-        if not met:
-            against = True
-    supports = accepted[0] and not against
+        if time_s - walls[0, k, 5] <= _OLD_S:
+            walls[0, k, 6] += 1.0
+            walls[0, k, 7] += 1.0 if met else 0.0
+        elif not met:
+            weight = absence_weight(walls[0, k, 6], walls[0, k, 7], all_due, all_met)
+            against = max(against, weight)
+    supports = accepted[0] and against < 1.0
     rejected[0] = accepted[0] = False
     return against, supports
 
@@ -415,8 +455,10 @@ class WallMemory(WallTable):
     ) -> tuple[Tensor, Tensor]:
         """Return whether the walls contradict the estimated position, and whether they support it.
 
-        Against: since the last call a known wall was rejected by the gate, or a wall that must be
-        near is not sensed. For: a wall known for long was where it should be.
+        Against: since the last call a known wall was rejected by the gate (1), or a wall that must
+        be near is not sensed (:func:`absence_weight`). For: a wall known for long was where it
+        should be. Walls known for less than a minute are neither: how often they are sensed where
+        they should be is learnt from them.
 
         Args:
             position_m: Estimated positions, ``(batch or 1, 2)``.
@@ -425,9 +467,9 @@ class WallMemory(WallTable):
             sure_m: Distance within which a wall is always sensed.
 
         Returns:
-            Against and for, boolean, ``(batch or 1,)`` each.
+            Against, 0 to 1, and for, boolean, ``(batch or 1,)`` each.
         """
-        against, supports = self.rejected, self.accepted
+        against, supports = self.rejected.to(self.errors), self.accepted
         if self.active.shape[1]:
             at = self.active.clamp_min(0).unsqueeze(-1).expand(-1, -1, self.walls.shape[-1])
             wall = Wall(*self.walls.gather(1, at).unbind(-1))
@@ -436,15 +478,30 @@ class WallMemory(WallTable):
             expected = wall.distance_m + dx * nx + dy * ny
             abreast = (dy * nx - dx * ny).abs() < _ABREAST * self.scale[0]
             old = self.since.time_s - wall.made_s > _OLD_S
-            due = abreast & old & (self.active >= 0) & (expected > 0) & (expected < sure_m)
+            due = abreast & (self.active >= 0) & (expected > 0) & (expected < sure_m)
             slack = 0.5 * sure_m
             alike = (wrap(bearing_rad.unsqueeze(1) - wall.bearing_rad.unsqueeze(2)).abs()
                      < _ALIKE_RAD)  # fmt: skip
             near = (distance_m.unsqueeze(1) - expected.unsqueeze(2)).abs() < slack
-            against = against | (due & ~(alike & near).any(-1)).any(-1)
+            met = (alike & near).any(-1)
+            weight = self._absence_weight(wall)
+            against = torch.maximum(against, weight.where(due & old & ~met, 0.0).amax(-1))
+            counts = torch.stack([due & ~old, due & ~old & met], -1).to(self.walls)
+            walls = self.walls.clone()
+            walls[..., 6:8].scatter_add_(1, at[..., :2], counts)
+            self.walls = walls
         self.rejected = torch.zeros_like(self.rejected)
         self.accepted = torch.zeros_like(self.accepted)
-        return against, supports & ~against
+        return against, supports & (against < 1.0)
+
+    def _absence_weight(self, wall: Wall) -> Tensor:
+        """Do as :func:`absence_weight` for the active walls of all animals."""
+        in_use = torch.arange(self.walls.shape[1], device=self.walls.device) < self.n_walls[:, None]
+        totals = (self.walls[..., 6:8] * in_use.unsqueeze(-1)).sum(1, keepdim=True)
+        of_all = (totals[..., 1] + _ALL_PRIOR) / (totals[..., 0] + _ALL_PRIOR)
+        share = ((wall.met + _PRIOR * of_all) / (wall.due + _PRIOR)).clamp_max(_SURELY)
+        most = math.log((1.0 - _CHANCE * _SURELY) / (1.0 - _SURELY))
+        return ((1.0 - _CHANCE * share) / (1.0 - share)).log() / most
 
     @without_gradients
     def observe_position(self, position_m: Tensor, measured_m: Tensor, sigma_m: float) -> Tensor:
@@ -522,16 +579,18 @@ class WallMemory(WallTable):
 
     def evidence_compiled(
         self, position_m: np.ndarray, distance_m: np.ndarray, bearing_rad: np.ndarray, sure_m: float
-    ) -> tuple[bool, bool, float]:
+    ) -> tuple[float, bool, float]:
         """Do as :meth:`evidence` for one animal, by bearings not less the compass error.
 
         Returns:
             Against and for, and the compass error.
         """
-        walls, _, active, _, errors, _, _, scale, rejected, accepted = cast(Arrays, self.arrays())
+        walls, n_walls, active, _, errors, _, _, scale, rejected, accepted = cast(
+            Arrays, self.arrays()
+        )
         against, supports = evidence_step(
-            position_m, distance_m, bearing_rad, sure_m, self.since.time_s, walls, active, scale,
-            rejected, accepted, errors,
+            position_m, distance_m, bearing_rad, sure_m, self.since.time_s, walls, n_walls, active,
+            scale, rejected, accepted, errors,
         )  # fmt: skip
         return against, supports, errors[0, 1]
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from neuroslam.errors import MapError
 
+_LEAST_FIELD_M2 = 0.002  # about three bins of 2.5 cm
 _ROUNDING_BINS = 1e-6  # a box that is a whole number of bins but for rounding gets no extra bin
 
 
@@ -271,7 +272,7 @@ class Fields(NamedTuple):
 
 
 def fields(
-    maps: np.ndarray, bin_m: float, threshold: float = 0.5, min_area_m2: float = 0.002
+    maps: np.ndarray, bin_m: float, threshold: float = 0.5, min_area_m2: float = _LEAST_FIELD_M2
 ) -> Fields:
     """Find the firing fields: connected regions above a share of the map's own peak.
 
@@ -308,6 +309,34 @@ def fields(
     count = np.bincount(cell[large], minlength=len(maps))
     largest = np.where(count > 0, largest, np.nan)
     return Fields(count, largest, 2.0 * np.sqrt(largest / np.pi))
+
+
+def field_activity(
+    maps: np.ndarray, sums: np.ndarray, bin_m: float, threshold: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cell of each firing field, and the activity summed over it.
+
+    Args:
+        maps: As for :func:`fields`.
+        sums: Activity summed in every bin, ``(N, n_y, n_x)``, as in :class:`RateMaps`.
+        bin_m: Side of a bin.
+        threshold: Share of the peak.
+
+    Example:
+        >>> two = np.array([[[9.0, 9.0, 0.0, 5.0], [9.0, 9.0, 0.0, 5.0]]])
+        >>> cell, total = field_activity(two, 2.0 * two, bin_m=0.1)
+        >>> cell.tolist(), total.tolist()
+        ([0, 0], [72.0, 20.0])
+    """
+    maps = _as_maps("field_activity", maps)
+    filled = np.where(np.isfinite(maps), maps, -np.inf)
+    peak = np.maximum(filled.max(axis=(1, 2), keepdims=True), 0.0)
+    labels, n = label_regions((filled > threshold * peak) & (peak > 0.0))
+    each = np.arange(1, n + 1)
+    cell = np.asarray(ndimage.maximum(np.arange(len(maps))[:, None, None], labels, each), np.int64)
+    total = np.asarray(ndimage.sum(sums, labels, each))
+    large = np.bincount(labels.ravel(), minlength=n + 1)[1:] * bin_m**2 >= _LEAST_FIELD_M2
+    return cell[large], total[large]
 
 
 def label_regions(above: np.ndarray) -> tuple[np.ndarray, int]:

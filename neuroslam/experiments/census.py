@@ -10,11 +10,14 @@ from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.navigation_state import NavigationEstimate
 from neuroslam.config import BrainConfig
 from neuroslam.evaluation.gridness import gridness
-from neuroslam.evaluation.ratemap import Bins, RateMaps, fields
+from neuroslam.evaluation.ratemap import Bins, RateMaps, field_activity, fields
 from neuroslam.experiments.animals import arena_of, simulate
 from neuroslam.figures.cells import Firing
 from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import SenseNoise
+
+ACTIVE_S = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Activity, rate times seconds, from which on a field may count as activated."""
 
 _PIECE = 1200  # steps whose rates are held before they are added to the maps
 
@@ -28,6 +31,8 @@ class Census(NamedTuple):
         skip: The same, unvisited bins left out.
         last: Grid score of the map since the previous census, unvisited bins silent.
         n_fields: Number of firing fields.
+        n_active: Those whose activity since the start is one of ``ACTIVE_S`` at least; one axis
+            more, for these.
         maps: Rate maps of the first seed, modules by cells, ``(m, c, n_y, n_x)``.
     """
 
@@ -36,6 +41,7 @@ class Census(NamedTuple):
     skip: np.ndarray
     last: np.ndarray
     n_fields: np.ndarray
+    n_active: np.ndarray
     maps: np.ndarray
 
 
@@ -77,6 +83,7 @@ class CensusRecorder:
         maps = np.stack([one.maps() for one in self.total])
         last = np.stack([one.maps() for one in self.recent]) if self.census else maps
         n_fields = np.stack([fields(one, self.bins.bin_m).n_fields for one in maps])
+        n_active = np.stack([self._count_active(one) for one in zip(self.total, maps, strict=True)])
         silent, skip = gridness(maps, "silent"), gridness(maps, "skip")
         recent = gridness(last, "silent") if self.census else silent
         self.census.append(
@@ -86,10 +93,19 @@ class CensusRecorder:
                 skip.reshape(self.shape),
                 recent.reshape(self.shape),
                 n_fields.reshape(self.shape),
+                n_active.reshape(*self.shape, len(ACTIVE_S)),
                 maps[0].reshape(*self.shape[1:], *self.bins.shape),
             )
         )
         self.recent = self._empty()
+
+    def _count_active(self, one: tuple[RateMaps, np.ndarray]) -> np.ndarray:
+        """Count the fields of each cell by their activity, ``(N, len(ACTIVE_S))``."""
+        total, maps = one
+        cell, activity = field_activity(maps, total.sums / self.walk.rate_hz, self.bins.bin_m)
+        return np.stack(
+            [np.bincount(cell[activity >= s], minlength=len(maps)) for s in ACTIVE_S], 1
+        )
 
 
 def arena_bins(walk: Walk) -> Bins:

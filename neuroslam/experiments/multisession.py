@@ -1,23 +1,26 @@
 """The experiments of the multisession paper, each compared with a single session.
 
 Menezes et al., "A Multisession SLAM Approach for RatSLAM", J. Intell. Robot. Syst. 108:61, 2023.
-Rendered worlds with similar routes replace recordings that are not public.
+Rendered worlds with similar routes replace recordings that are not public. Each experiment runs
+three brains on the same frames: ours, ours under the paper's rule of merging, and the paper's
+Table 1 under its rule.
 """
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroslam.config import BrainConfig, build_config, merge_values, read_preset
+from neuroslam.config import build_config, merge_values, read_preset
 from neuroslam.errors import RunError
 from neuroslam.evaluation.icp import map_rmse
 from neuroslam.evaluation.trajectory import AlignmentMode, align
 from neuroslam.experiments.session_runs import (
+    SessionRecorder,
     SessionRun,
     bindings,
     measure,
@@ -47,6 +50,7 @@ class Plan(NamedTuple):
         config: Parameters that differ from the preset.
         paper_rmse: The paper's ICP RMSE, in its own map units; NaN without one.
         preset: Name of the preset; empty: the defaults.
+        table: Name of the preset with the experiment's column of the paper's Table 1; empty: none.
     """
 
     title: str
@@ -55,6 +59,35 @@ class Plan(NamedTuple):
     config: dict[str, Any] = {}  # noqa: RUF012
     paper_rmse: float = math.nan
     preset: str = ""
+    table: str = ""
+
+
+OURS, BY_RULE, BY_TABLE = "ours", "our parameters, paper's rule", "Table 1, paper's rule"
+"""Names of the three brains of an experiment."""
+
+
+def variants(plan: Plan) -> dict[str, dict[str, Any]]:
+    """Return the parameters of the brains of an experiment, by name.
+
+    The paper's rule is the preset ``multisession_2023``: the first view match decides, pose cells
+    are only shifted, and no merge is refused. Of Table 1, odometry and the size of a pose cell,
+    which belong to the paper's cameras and robots, are replaced by those of the plan.
+
+    Example:
+        >>> variants(PLANS["campus"])["Table 1, paper's rule"]["view"]["threshold"]
+        0.059
+    """
+    ours = merge_values(read_preset(plan.preset) if plan.preset else {}, plan.config)
+    rule = read_preset("multisession_2023")
+    named = {OURS: ours, BY_RULE: merge_values(ours, rule)}
+    if plan.table:
+        table = read_preset(plan.table)
+        size = build_config(ours, plan.title).pose_cells.cell_size_m
+        kept = {name: table[name] for name in ("view", "map")}
+        cells = {**table["pose_cells"], "cell_size_m": size}
+        odometry = {"odometry": ours["odometry"]} if "odometry" in ours else {}
+        named[BY_TABLE] = merge_values({**kept, "pose_cells": cells, **odometry}, rule)
+    return named
 
 
 def equal_parts(k: int) -> Callable[[IndexedSource], list[Cut]]:
@@ -81,9 +114,18 @@ def _lab_tour(source: IndexedSource) -> list[Cut]:
     return [(0, round(2.0 * laps)), (round(2.5 * laps), source.n_frames)]
 
 
-def _town(source: IndexedSource) -> list[Cut]:
-    """Cut into two laps around each block, and the outer lap."""
-    return _cut_at_passes(source, (0.0, 0.0), 4.0, (3, 5, 7, 9))
+def _district(source: IndexedSource) -> list[Cut]:
+    """Cut into laps of each corner block, and the outer lap, which passes all of them.
+
+    Neither these laps nor the streets between them have a street in common, so no two of the first
+    four sessions see the same place.
+    """
+    x, y = _truths(source)[:, :2].T
+    inside = (np.abs(x) > 13.0) & (np.abs(y) > 10.0)
+    corner = np.where(inside, 1 + (x > 0) + 2 * (y > 0), 0)
+    begins = np.flatnonzero(np.diff(corner, prepend=0) * inside)[:4].tolist()
+    ends = [first + int(np.flatnonzero(~inside[first:])[0]) for first in begins]
+    return [*zip(begins, ends, strict=True), (ends[-1], source.n_frames)]
 
 
 def _campus(source: IndexedSource) -> list[Cut]:
@@ -100,22 +142,13 @@ def _truths(source: IndexedSource) -> np.ndarray:
     return source.truths()
 
 
-def _cut_at_passes(
-    source: IndexedSource, at_m: tuple[float, float], radius_m: float, passes: tuple[int, ...]
-) -> list[Cut]:
-    """Cut a drive at some of its passes of a position."""
-    apart = np.hypot(*(_truths(source)[:, :2] - at_m).T)
-    inside = np.flatnonzero((apart[1:] < radius_m) & (apart[:-1] >= radius_m)) + 1
-    ends = [int(inside[k - 1]) for k in passes]
-    return list(zip([0, *ends], [*ends, source.n_frames], strict=True))
-
-
 PLANS = {
     "virtual-tour": Plan(
         "Virtual tour",
         "world:ellipse?laps=3.8&width=256&height=64",
         _virtual_tour,
         paper_rmse=0.00773327,
+        table="virtual_tour",
     ),
     "lab-tour": Plan(
         "Lab tour",
@@ -123,16 +156,18 @@ PLANS = {
         _lab_tour,
         {"odometry": {"speed_scaling_m_s": 50.0}, "pose_cells": {"cell_size_m": 0.5}},
         paper_rmse=0.00883269,
+        table="lab_tour",
     ),
     "five-sessions": Plan(
-        "Five sessions in a town",
-        "world:town?route=6&laps=1&noise=0.03",
-        _town,
+        "Five sessions in a district",
+        "world:district?route=6&laps=1&noise=0.03",
+        _district,
         {
             "view": {"threshold": 0.035, "template_height": 20},
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=0.0127,
+        table="irat",
     ),
     "campus": Plan(
         "Three sessions on a campus",
@@ -143,6 +178,7 @@ PLANS = {
             "pose_cells": {"cell_size_m": 2.0},
         },
         paper_rmse=85.0,
+        table="new_college",
     ),
 }
 
@@ -158,29 +194,49 @@ class Result(NamedTuple):
 
 def run_plan(plan: Plan, overrides: dict[str, Any] | None = None) -> Result:
     """Run all frames in one session, and in several, each with the map of those before."""
-    values = merge_values(read_preset(plan.preset) if plan.preset else {}, plan.config)
-    config = build_config(merge_values(values, overrides or {}), plan.title)
-    source = open_source(plan.source, config.frame_rate_hz, config.view.grey)
+    ours = variants(plan)[OURS]
+    return run_variants(plan, {OURS: merge_values(ours, overrides or {})})[OURS]
+
+
+def run_variants(plan: Plan, named: Mapping[str, Mapping[str, Any]]) -> dict[str, Result]:
+    """Run several brains on the same frames, each of which is made once.
+
+    Args:
+        plan: The experiment; the first brain's frame rate and colours hold for all.
+        named: Name of a brain -> its parameters.
+    """
+    configs = {name: build_config(dict(values), plan.title) for name, values in named.items()}
+    first = next(iter(configs.values()))
+    source = open_source(plan.source, first.frame_rate_hz, first.view.grey)
     if not isinstance(source, IndexedSource):
         raise RunError(f"{plan.source}: is read in order only; expected frames by number")
-    single = run_session(source.frames(), config, name=plan.source)
     cuts = plan.cuts(source)
-    return Result(single, _sessions(plan, config, source, cuts), cuts, source)
+    singles = {name: SessionRecorder(config, name=plan.source) for name, config in configs.items()}
+    parts: dict[str, list[SessionRecorder]] = {name: [] for name in configs}
+    session = 0
+    for i, frame in enumerate(source.frames()):
+        if session < len(cuts) and i == cuts[session][1]:
+            session += 1
+        inside = session < len(cuts) and cuts[session][0] <= i < cuts[session][1]
+        for name, config in configs.items():
+            singles[name].step(frame)
+            runs = parts[name]
+            if inside and len(runs) == session:
+                stored = runs[-1].brain if runs else None
+                runs.append(SessionRecorder(config, stored, plan.source))
+            if inside:
+                runs[session].step(frame)
+    return {
+        name: Result(singles[name].result(), [one.result() for one in runs], cuts, source)
+        for name, runs in parts.items()
+    }
 
 
-def _sessions(
-    plan: Plan, config: BrainConfig, source: IndexedSource, cuts: list[Cut]
-) -> list[SessionRun]:
-    runs: list[SessionRun] = []
-    for first, stop in cuts:
-        stored = runs[-1].brain if runs else None
-        runs.append(run_session(source.frames(first, stop), config, stored, plan.source))
-    return runs
-
-
-def _rows(plan: Plan, result: Result, name: str = "multi-session") -> list[dict[str, Any]]:
+def _rows(
+    plan: Plan, result: Result, name: str = "multi-session", alone: str = "single session"
+) -> list[dict[str, Any]]:
     everything = np.arange(len(result.single.trace["session"]))
-    rows = [measure("single session", [result.single], None, everything)]
+    rows = [measure(alone, [result.single], None, everything)]
     rows.append(measure(name, result.runs, result.single, _frames_of(result.cuts)))
     rows[-1]["paper_icp_rmse_in_its_units"] = plan.paper_rmse
     return rows
@@ -211,23 +267,34 @@ def draw(plan: Plan, result: Result, out: Path, stem: str = "") -> None:
         np.column_stack(here.links[:2]),
     )
     save(overlay, out / f"{stem}overlay.png")
-    rows = []
-    n_single = len(single.trace["session"])
+    pairs = (("single session", [single]), ("multi-session", runs))
+    rows = [_track_of(name, own, result.source) for name, own in pairs]
+    if all(np.isfinite(row[2]).all() for row in rows):
+        title = f"{plan.title}: tracks and truth"
+        save(plot_accuracy(rows, title), out / f"{stem}accuracy.png")
+
+
+def draw_variants(plan: Plan, results: Mapping[str, Result], out: Path) -> None:
+    """Write the tracks of several brains beside each other, with the truth."""
+    rows = [
+        _track_of(f"{name[:1].upper()}{name[1:]}", result.runs, result.source)
+        for name, result in results.items()
+    ]
+    title = f"{plan.title}: all brains on the same frames"
+    save(plot_accuracy(rows, title), out / "against_the_paper.png")
+
+
+def _track_of(
+    name: str, runs: list[SessionRun], source: IndexedSource
+) -> tuple[str, np.ndarray, np.ndarray, float, list[Cut]]:
+    """Return a row of :func:`plot_accuracy`; frames on maps that were not joined have no track."""
     ends = np.cumsum([0, *(len(run.trace["session"]) for run in runs)]).tolist()
-    for name, own, ranges in (
-        ("single session", [single], [(0, n_single)]),
-        ("multi-session", runs, list(pairwise(ends))),
-    ):
-        xy, truth = track(own[-1].brain, own)
-        if not np.isfinite(truth).all():
-            return
-        on = np.isfinite(xy[:, 0])
-        mode: AlignmentMode = "rigid" if result.source.frame(0).velocity else "similarity"
-        moved = align(xy[on], truth[on], mode).apply(xy)
-        error = float(np.sqrt(np.mean(np.sum((moved - truth)[on] ** 2, axis=1))))
-        rows.append((name, moved, truth, error, ranges))
-    title = f"{plan.title}: tracks and truth"
-    save(plot_accuracy(rows, title), out / f"{stem}accuracy.png")
+    xy, truth = track(runs[-1].brain, runs)
+    on = np.isfinite(xy[:, 0]) & np.isfinite(truth[:, 0])
+    mode: AlignmentMode = "rigid" if source.frame(0).velocity else "similarity"
+    moved = align(xy[on], truth[on], mode).apply(xy) if on.any() else xy
+    error = float(np.sqrt(np.mean(np.sum((moved - truth)[on] ** 2, axis=1))))
+    return name, moved, truth, error, list(pairwise(ends))
 
 
 def _write(
@@ -245,9 +312,13 @@ def _write(
 
 def _repeat(name: str, out: Path) -> dict[str, Any]:
     plan, out = PLANS[name], Path(out)
-    result = run_plan(plan)
-    draw(plan, result, out)
-    return _write(name, _rows(plan, result), result.runs, out)
+    results = run_variants(plan, variants(plan))
+    rows = _rows(plan, results[OURS])
+    rows += _rows(plan, results[BY_RULE], f"multi-session: {BY_RULE}")[1:]
+    rows += _rows(plan, results[BY_TABLE], f"multi-session: {BY_TABLE}", "single session: Table 1")
+    draw(plan, results[OURS], out)
+    draw_variants(plan, results, out)
+    return _write(name, rows, [run for each in results.values() for run in each.runs], out)
 
 
 def virtual_tour(_data: Path | None, out: Path) -> dict[str, Any]:
@@ -261,24 +332,13 @@ def lab_tour(_data: Path | None, out: Path) -> dict[str, Any]:
 
 
 def five_sessions(_data: Path | None, out: Path) -> dict[str, Any]:
-    """Map the blocks of a town in four sessions, and join them in a fifth (Figs. 15, 16)."""
+    """Map four blocks that share no street, and join them in a fifth session (Figs. 15, 16)."""
     return _repeat("five-sessions", out)
 
 
 def campus(_data: Path | None, out: Path) -> dict[str, Any]:
-    """Map a campus of more than 20 000 frames in three sessions (paper's Figs. 17, 18).
-
-    The same frames again under the rule of the paper, preset ``multisession_2023``: the first view
-    match decides, pose cells are only shifted, and no merge is refused.
-    """
-    plan, out = PLANS["campus"], Path(out)
-    result = run_plan(plan)
-    by_rule = run_plan(plan, read_preset("multisession_2023"))
-    rows = _rows(plan, result, "multi-session")
-    rows.append(_rows(plan, by_rule, "multi-session, rule of the paper")[1])
-    draw(plan, result, out)
-    draw(plan._replace(title=f"{plan.title}, rule of the paper"), by_rule, out, "rule_of_paper_")
-    return _write("campus", rows, [*result.runs, *by_rule.runs], out)
+    """Map a campus of more than 20 000 frames in three sessions (paper's Figs. 17, 18)."""
+    return _repeat("campus", out)
 
 
 def virtual_tour_no_shift(_data: Path | None, out: Path) -> dict[str, Any]:

@@ -73,29 +73,39 @@ class SessionRun(NamedTuple):
     created_at_known_views: int
 
 
-@torch.inference_mode()
-def run_session(
-    frames: Iterable[Frame],
-    config: BrainConfig,
-    stored: NavigationBrain | None = None,
-    name: str = "",
-) -> SessionRun:
-    """Run a new brain on frames, with the maps of another stored in it."""
-    brain = NavigationBrain(config)
-    brain.about = (name, "", "")
-    if stored is not None:
-        brain.store(stored)
-    rows, created = [], 0
-    merge_snapshots: list[MergeSnapshots] = []
-    for frame in frames:
+class SessionRecorder:
+    """A session that is stepped frame by frame, so that several can take the same frames.
+
+    Args:
+        config: Of the brain.
+        stored: Brain whose maps are stored in the new one.
+        name: Name of the source.
+    """
+
+    def __init__(
+        self, config: BrainConfig, stored: NavigationBrain | None = None, name: str = ""
+    ) -> None:
+        self.brain = NavigationBrain(config)
+        self.brain.about = (name, "", "")
+        if stored is not None:
+            self.brain.store(stored)
+        self._rows: list[tuple[float, ...]] = []
+        self._created = 0
+        self._merges: list[MergeSnapshots] = []
+
+    @torch.inference_mode()
+    def step(self, frame: Frame) -> None:
+        """Advance the brain by a frame, and note its map around a merge."""
+        brain = self.brain
         partial, others, merges = brain.map, list(brain.stored), len(brain.sessions.merges)
         result = brain(frame)
-        created += bool(merge_snapshots) and result.action == "create" and not result.view.is_new
+        new = result.action == "create" and not result.view.is_new
+        self._created += bool(self._merges) and new
         truth = frame.truth or (np.nan, np.nan, np.nan)
-        rows.append((*brain.map.origin, *brain.map.offset, *truth[:2]))
+        self._rows.append((*brain.map.origin, *brain.map.offset, *truth[:2]))
         if len(brain.sessions.merges) > merges:
             (loaded,) = (one for one in others if all(one is not left for left in brain.stored))
-            merge_snapshots.append(
+            self._merges.append(
                 MergeSnapshots(
                     frame.index,
                     MapSnapshot.of(loaded.map),
@@ -104,8 +114,25 @@ def run_session(
                     brain.sessions.merges[-1],
                 )
             )
-    table = np.array(rows)
-    return SessionRun(brain, dict(zip(_TRACE, table.T, strict=True)), merge_snapshots, created)
+
+    def result(self) -> SessionRun:
+        """Return the session so far."""
+        columns: list[np.ndarray] = [*np.array(self._rows).T]
+        trace: dict[str, np.ndarray] = dict(zip(_TRACE, columns, strict=True))
+        return SessionRun(self.brain, trace, list(self._merges), self._created)
+
+
+def run_session(
+    frames: Iterable[Frame],
+    config: BrainConfig,
+    stored: NavigationBrain | None = None,
+    name: str = "",
+) -> SessionRun:
+    """Run a new brain on frames, with the maps of another stored in it."""
+    session = SessionRecorder(config, stored, name)
+    for frame in frames:
+        session.step(frame)
+    return session.result()
 
 
 def track(brain: NavigationBrain, runs: list[SessionRun]) -> tuple[np.ndarray, np.ndarray]:

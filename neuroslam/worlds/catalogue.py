@@ -128,17 +128,11 @@ def _figure_eight(look: int) -> World:
 def _town(look: int) -> World:
     """Small town of four blocks; routes 1-4 go around one each, 5 around all, 6: all of these."""
     site = Site(look + 3000, sun_rad=2.2)
-
-    def house(rng: np.random.Generator, length: float) -> tuple[np.ndarray, float]:
-        return paint_outdoors.facade(
-            rng, length, rng.choice([5.0, 6.4, 8.0, 9.2, 10.6]), 24.0
-        ), 24.0
-
     for x, y in ((4.0, 4.0), (-30.0, 4.0), (-30.0, -24.0), (4.0, -24.0)):
-        site.block(x, y, x + 26.0, y + 20.0, (6.0, 9.5), house)
+        site.block(x, y, x + 26.0, y + 20.0, (6.0, 9.5), _house)
     ring = _rectangle(38.0, 32.0, clockwise=True)
     for a, b in pairwise(ring):
-        site.lots(a, b, (6.0, 10.0), house)
+        site.lots(a, b, (6.0, 10.0), _house)
     for _ in range(16):
         side = site.rng.choice([-1.0, 1.0], 2)
         if site.rng.uniform() < 0.5:
@@ -153,7 +147,8 @@ def _town(look: int) -> World:
             )
         tall = site.rng.uniform(3.5, 5.5)
         site.figure(x, y, tall / 1.5, tall, paint_outdoors.tree(site.rng))
-    ground = _streets(site.rng)
+    zebras = ((38.5, 38.2), (38.5, 26.8), (38.5, 54.5), (38.5, 10.5))
+    ground = _streets(site.rng, (-34.0, 0.0, 34.0), (-28.0, 0.0, 28.0), zebras)
     around = [(0.0, 0.0), (34.0, 0.0), (34.0, 28.0), (0.0, 28.0)]
     routes = [
         rounded_route([(x + dx, y + dy) for x, y in around], 4.0)
@@ -184,37 +179,97 @@ def _town(look: int) -> World:
     )
 
 
-def _streets(rng: np.random.Generator) -> Surface:
-    """Paint asphalt with pavements along the houses, centre lines and crossings."""
-    per_m = 14.0
-    c = paint_outdoors.floor(rng, 77.0, 65.0, per_m, "asphalt")
-    edges_x, edges_y = (-38.0, -30.0, -4.0, 4.0, 30.0, 38.0), (-32.0, -24.0, -4.0, 4.0, 24.0, 32.0)
+def _district(look: int) -> World:
+    """Nine blocks of houses; routes 1-4: laps of a corner block, 5: of all, 6: all of these."""
+    site = Site(look + 5000, sun_rad=2.2)
+    xs, ys = (-51.0, -17.0, 17.0, 51.0), (-42.0, -14.0, 14.0, 42.0)
+    for x in xs[:-1]:
+        for y in ys[:-1]:
+            site.block(x + 4.0, y + 4.0, x + 30.0, y + 24.0, (6.0, 9.5), _house)
+    for a, b in pairwise(_rectangle(55.0, 46.0, clockwise=True)):
+        site.lots(a, b, (6.0, 10.0), _house)
+    for _ in range(24):
+        tall, side = site.rng.uniform(3.5, 5.5), site.rng.choice([-2.9, 2.9])
+        if site.rng.uniform() < 0.5:
+            x, y = (
+                site.rng.choice(xs[:-1]) + site.rng.uniform(6.0, 28.0),
+                site.rng.choice(ys) + side,
+            )
+        else:
+            x, y = (
+                site.rng.choice(xs) + side,
+                site.rng.choice(ys[:-1]) + site.rng.uniform(6.0, 22.0),
+            )
+        site.figure(x, y, tall / 1.5, tall, paint_outdoors.tree(site.rng))
+    ground = _streets(site.rng, xs, ys, ())
+    ring = [(-51.0, -42.0), (51.0, -42.0), (51.0, 42.0), (-51.0, 42.0)]
+    # Each lap begins where the tour arrives, along the edge of the district.
+    laps = [
+        [(-17.0, -42.0), (-17.0, -14.0), (-51.0, -14.0), (-51.0, -42.0)],
+        [(51.0, -42.0), (51.0, -14.0), (17.0, -14.0), (17.0, -42.0)],
+        [(51.0, 42.0), (17.0, 42.0), (17.0, 14.0), (51.0, 14.0)],
+        [(-51.0, 42.0), (-51.0, 14.0), (-17.0, 14.0), (-17.0, 42.0)],
+    ]
+    first, second, third, fourth = (lap + lap for lap in laps)
+    tour = [*first, *second, ring[1], *third, ring[2], *fourth, ring[3], *ring, ring[0]]
+    return site.build(
+        name="district",
+        description=_first_line(_district),
+        ground=ground,
+        sky=paint_outdoors.sky(site.rng),
+        routes=[rounded_route(one, 4.0) for one in (*laps, ring, tour)],
+        lanes_m=(2.2, -2.2),
+        sense=Sense(frames_per_lap=350, horizon=0.62, camera_height_m=1.5),
+        haze=(196, 208, 222),
+        sight_m=90.0,
+    )
+
+
+def _house(rng: np.random.Generator, length: float) -> tuple[np.ndarray, float]:
+    return paint_outdoors.facade(rng, length, rng.choice([5.0, 6.4, 8.0, 9.2, 10.6]), 24.0), 24.0
+
+
+def _streets(
+    rng: np.random.Generator,
+    xs: tuple[float, ...],
+    ys: tuple[float, ...],
+    zebras: tuple[tuple[float, float], ...],
+) -> Surface:
+    """Paint asphalt with pavements along the houses, centre lines and crossings.
+
+    Args:
+        rng: Random numbers of the textures.
+        xs: Middle lines of the streets along y.
+        ys: Middle lines of the streets along x.
+        zebras: Centres of zebra crossings, from the corner of the ground.
+    """
+    per_m, to_x, to_y = 14.0, 4.5 - xs[0], 4.5 - ys[0]
+    width_m, depth_m = xs[-1] + to_x + 4.5, ys[-1] + to_y + 4.5
+    c = paint_outdoors.floor(rng, width_m, depth_m, per_m, "asphalt")
     pave = c.image.copy()
     paint.masonry(pave, rng, (168, 162, 152), (0.8 * per_m, 0.8 * per_m), 0.12, staggered=False)
     street = np.zeros(c.image.shape[:2], dtype=bool)
-    for low, high in ((0, 1), (2, 3), (4, 5)):
-        (left, _), (right, _) = (
-            c.px(edges_x[i] + 38.5 + s, 0.0) for i, s in ((low, 1.7), (high, -1.7))
-        )
+    for x in xs:
+        (left, _), (right, _) = (c.px(x + to_x + side, 0.0) for side in (-2.3, 2.3))
         street[:, left:right] = True
-        (_, bottom), (_, top) = (
-            c.px(0.0, edges_y[i] + 32.5 + s) for i, s in ((low, 1.7), (high, -1.7))
-        )
+    for y in ys:
+        (_, bottom), (_, top) = (c.px(0.0, y + to_y + side) for side in (-2.3, 2.3))
         street[top:bottom] = True
     c.image[~street] = pave[~street]
     white = (222, 220, 210)
-    for x in (4.5, 38.5, 72.5):
-        for y in np.arange(1.5, 63.0, 3.0):
-            if min(abs(y - m) for m in (4.5, 32.5, 60.5)) > 4.0:
+    middle_x, middle_y = [x + to_x for x in xs], [y + to_y for y in ys]
+    for x in middle_x:
+        for y in np.arange(1.5, depth_m - 2.0, 3.0):
+            if min(abs(y - m) for m in middle_y) > 4.0:
                 c.rect(x - 0.08, y, x + 0.08, y + 1.5, white)
-    for y in (4.5, 32.5, 60.5):
-        for x in np.arange(1.5, 75.0, 3.0):
-            if min(abs(x - m) for m in (4.5, 38.5, 72.5)) > 4.0:
+    for y in middle_y:
+        for x in np.arange(1.5, width_m - 2.0, 3.0):
+            if min(abs(x - m) for m in middle_x) > 4.0:
                 c.rect(x, y - 0.08, x + 1.5, y + 0.08, white)
-    for x, y in ((38.5, 38.2), (38.5, 26.8), (38.5, 54.5), (38.5, 10.5)):  # zebra crossings
+    for x, y in zebras:
         for dx in np.arange(-2.2, 2.2, 0.8):
             c.rect(x + dx, y - 0.9, x + dx + 0.4, y + 0.9, white)
-    return Surface(c.image, per_m, -38.5, -32.5, 0.0)
+    return Surface(c.image, per_m, -to_x, -to_y, 0.0)
 
 
 def _campus(look: int) -> World:
@@ -309,6 +364,7 @@ _BUILDERS: dict[str, Callable[[int], World]] = {
     "figure_eight": _figure_eight,
     "town": _town,
     "campus": _campus,
+    "district": _district,
 }
 
 
@@ -317,7 +373,7 @@ def catalogue() -> dict[str, str]:
 
     Example:
         >>> list(catalogue())
-        ['corridor', 'ellipse', 'figure_eight', 'town', 'campus']
+        ['corridor', 'ellipse', 'figure_eight', 'town', 'campus', 'district']
     """
     return {name: _first_line(builder) for name, builder in _BUILDERS.items()}
 

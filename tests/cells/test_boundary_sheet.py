@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam.cells.boundary_sheet import BoundarySheet, unwarp, warp, warped_tuning
+from neuroslam.cells.boundary_sheet import (
+    BoundarySheet,
+    foot_of_beams,
+    unwarp,
+    warp,
+    warped_tuning,
+)
 from neuroslam.cells.convolve import (
     circular_convolve,
     convolve_axes,
@@ -60,6 +66,39 @@ def test_walls_closer_than_the_kernel_merge_and_farther_stay_two():
     for second_m, n in ((0.12, 1), (0.28, 2)):
         found, _, _ = SHEET.read(SHEET(tensor(0.1, second_m), tensor(1.0, 1.0)))
         assert found.isfinite().sum() == n
+
+
+@pytest.mark.parametrize("radius_m", [0.5, 100.0])
+def test_a_wall_in_noisy_scans_is_read_once_and_without_bias_curved_or_straight(radius_m):
+    """Beams of 3 cm noise and 10 % outliers; the cells alone read the curved wall 9 mm too near."""
+    rng, angle = np.random.default_rng(5), TWO_PI * np.arange(180) / 180
+    off, distance_m = [], 0.25
+    for _ in range(100):
+        ahead = (radius_m - distance_m) * np.cos(angle)
+        ranges = -ahead + np.sqrt(ahead**2 + 2.0 * radius_m * distance_m - distance_m**2)
+        ranges = np.maximum(ranges + 0.03 * rng.standard_normal(180), 0.0)
+        wrong = rng.random(180) < 0.1
+        ranges[wrong] = rng.uniform(0.0, 5.0, int(wrong.sum()))
+        walls = SHEET.walls_in_scan(ranges)
+        off += [row for row in walls - [distance_m, 0.0] if row[0] < 0.05]
+    off_m, off_rad = np.array(off).T
+    off_rad = (off_rad + math.pi) % TWO_PI - math.pi
+    assert 90 <= len(off) <= 102
+    assert abs(off_m.mean()) < 0.005
+    assert off_m.std() < 0.01
+    assert abs(off_rad.mean()) < math.radians(1.0)
+    # The nearer the middle of a circle, the less its nearest point is defined.
+    assert off_rad.std() < math.radians(6.0) / (1.0 - distance_m / radius_m)
+
+
+def test_beams_of_another_wall_are_no_foot_of_one():
+    """A maximum 40 degrees beside the foot of the perpendicular."""
+    angle = TWO_PI * np.arange(180) / 180
+    ranges = np.where(np.cos(angle) > 0.1, 0.2 / np.maximum(np.cos(angle), 0.1), math.inf)
+    assert foot_of_beams(ranges, 0.2, 0.1, 0.05) == pytest.approx((0.2, 0.0), abs=1e-6)
+    assert foot_of_beams(ranges, 0.2, math.radians(40.0), 0.05) is None
+    few = np.where(np.arange(180) < 3, ranges, math.inf)
+    assert foot_of_beams(few, 0.2, 0.1, 0.05) == (0.2, 0.1)  # too few to tell
 
 
 def test_turning_the_animal_rolls_the_sheet():

@@ -284,6 +284,44 @@ def test_missing_known_walls_contradict_the_position_and_present_ones_support_it
     assert (against.item(), supports.item()) == (True, False)
 
 
+@pytest.mark.parametrize("batch", [None, 1])
+def test_the_absence_of_a_wall_counts_by_how_often_it_was_sensed_at_first(batch):
+    """A wall that was read once from a noisy scan, and never again, contradicts nothing."""
+    memory = WallMemory(WallMemoryConfig(period_s=0.0), batch)
+    at, east, north = torch.zeros(2, dtype=torch.float64), tensor([0.0]), tensor([math.pi / 2])
+
+    def against(there):
+        felt = tensor([[0.05 if there else math.inf]])
+        return memory.evidence(at[None], felt, east[None], 0.18)[0].item()
+
+    def sense(bearing):
+        memory.move(*(tensor(0.0).expand(() if batch is None else batch) for _ in range(2)), 0.1)
+        one = at, tensor([0.05]), bearing
+        memory.update_from_walls(*(one if batch is None else (part[None] for part in one)))
+
+    sense(north)  # the outlier
+    for _ in range(4):
+        sense(east)
+        assert against(there=True) == 0.0
+    assert memory.walls[0, :2, 6:].tolist() == [[4.0, 0.0], [4.0, 4.0]]
+    memory.since.time_s += 61.0
+    wrong, right = against(there=True), against(there=False)
+    assert 0.0 < wrong < 0.05  # the outlier alone is missing
+    assert wrong < right < 1.0
+    assert memory.walls[0, :2, 6:].tolist() == [[4.0, 0.0], [4.0, 4.0]]  # learnt at first only
+
+
+def test_walls_saved_without_counts_are_read_with_none():
+    memory = WallMemory(WallMemoryConfig())
+    memory.update_from_walls(torch.zeros(2), tensor([0.2]), tensor([0.0]))
+    state = memory.state_dict()
+    again = WallMemory(WallMemoryConfig())
+    again.load_state_dict(state | {"walls": state["walls"][..., :6].clone()})
+    assert torch.equal(again.walls[..., :6], state["walls"][..., :6])
+    assert again.walls.shape == state["walls"].shape
+    assert not again.walls[..., 6:].any()
+
+
 def test_forgetting_the_position_keeps_walls_and_learnt_errors():
     path = Path(senses_in("triangle", 1.0, SenseNoise()))
     memory = path.memory

@@ -8,7 +8,7 @@ import pytest
 
 from neuroslam.config import build_config
 from neuroslam.experiments import multisession, run_experiment
-from neuroslam.experiments.multisession import PLANS, run_plan, wrong_merges
+from neuroslam.experiments.multisession import PLANS, run_plan, variants, wrong_merges
 from neuroslam.experiments.session_runs import run_session
 from neuroslam.sensors import open_source
 
@@ -75,14 +75,34 @@ def test_the_lab_tour_joins_where_the_rectangles_meet(tmp_path):
     assert multi["ate_similarity_m"] <= 1.2 * single["ate_similarity_m"]
 
 
-def test_sessions_of_the_town_are_laps_of_a_block_each_and_the_outer_lap():
+def test_four_of_five_sessions_share_no_street_and_the_fifth_passes_all():
     source = open_source(PLANS["five-sessions"].source)
     cuts, truth = PLANS["five-sessions"].cuts(source), source.truths()[:, :2]
-    assert [cut[0] for cut in cuts[1:]] == [cut[1] for cut in cuts[:-1]]
-    assert (cuts[0][0], cuts[-1][1]) == (0, source.n_frames)
-    sides = [np.sign(np.mean(truth[a:b], axis=0)).tolist() for a, b in cuts[:-1]]
-    assert sides == [[1, 1], [1, -1], [-1, -1], [-1, 1]]
-    assert np.ptp(truth[slice(*cuts[-1])], axis=0) == pytest.approx([68.0, 56.0], abs=0.1)
+    assert (cuts[0][0], cuts[-1][1], len(cuts)) == (0, source.n_frames, 5)
+    laps = [truth[a:b] for a, b in cuts]
+    sides = [np.sign(np.mean(lap, axis=0)).tolist() for lap in laps[:-1]]
+    assert sides == [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+
+    def apart(one, other):
+        return np.linalg.norm(one[:, None] - other, axis=-1).min()
+
+    pairs = [(one, other) for k, one in enumerate(laps[:-1]) for other in laps[:k]]
+    assert min(apart(*pair) for pair in pairs) > 20.0
+    assert all(apart(lap, laps[-1]) < 0.01 for lap in laps[:-1])
+    assert np.ptp(laps[-1], axis=0) == pytest.approx([102.0, 84.0], abs=0.1)
+
+
+def test_table_1_of_the_paper_is_run_beside_our_parameters():
+    for name, table in (("virtual-tour", 0.05), ("lab-tour", 0.04), ("five-sessions", 0.035),
+                        ("campus", 0.059)):  # fmt: skip
+        ours, rule, paper = (build_config(one) for one in variants(PLANS[name]).values())
+        assert paper.view.threshold == table
+        assert paper.pose_cells.cell_size_m == ours.pose_cells.cell_size_m
+        assert (ours.sessions.confirm, ours.sessions.cells) == (4, "turn")
+        assert rule.view == ours.view
+        for one in (rule, paper):
+            assert (one.sessions.confirm, one.sessions.cells) == (1, "shift")
+            assert not one.sessions.check_residuals
 
 
 def test_sessions_of_the_campus_are_the_court_the_park_and_everything():
