@@ -328,6 +328,8 @@ def field_activity(
         >>> cell.tolist(), total.tolist()
         ([0, 0], [72.0, 20.0])
     """
+    from scipy import ndimage
+
     maps = _as_maps("field_activity", maps)
     filled = np.where(np.isfinite(maps), maps, -np.inf)
     peak = np.maximum(filled.max(axis=(1, 2), keepdims=True), 0.0)
