@@ -429,15 +429,16 @@ def _stop(_number: int, _frame: object) -> None:
 _STOPS = (signal.SIGTERM, signal.SIGALRM)
 
 
-def campaign(scale: float = 1.0, only: str = "", seconds: float = 0.0) -> Tally:
+def campaign(scale: float = 1.0, only: str = "", seconds: float = 0.0, seed: int = SEED) -> Tally:
     """Run all parts, or those whose names contain ``only``.
 
     Args:
         scale: Share of the cases.
         only: Part of the names.
         seconds: Longest time of each part; cases come in random order; 0: no limit.
+        seed: Of all choices.
     """
-    tally, rng = Tally(), np.random.default_rng(SEED)
+    tally, rng = Tally(), np.random.default_rng(seed)
     parts: dict[str, Callable[[Path], None]] = {
         "kills": lambda base: kills(base, tally, round(scale * KILLS), rng),
         "disks": lambda base: full_disks(base, tally, round(scale * SIZES), rng),
@@ -462,8 +463,9 @@ if __name__ == "__main__":
     parser.add_argument("--scale", type=float, default=1.0, help="share of the cases")
     parser.add_argument("--only", default="", help="kills, disks, writers or damages")
     parser.add_argument("--seconds", type=float, default=0.0, help="longest time of each part")
+    parser.add_argument("--seed", type=int, default=SEED)
     options = parser.parse_args()
-    tally = campaign(options.scale, options.only, options.seconds)
+    tally = campaign(options.scale, options.only, options.seconds, options.seed)
     print(tally.table())
     for line in tally.failures:
         print(line)

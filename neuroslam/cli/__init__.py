@@ -1,5 +1,6 @@
 """The command line: each command parses, calls one function of the library, and prints."""
 
+import errno
 import io
 import os
 import sys
@@ -154,6 +155,17 @@ def _warnings_in_one_line(command: str) -> Iterator[None]:
         yield
 
 
+def _mistake(error: BaseException) -> str:
+    """Return the line for an error of memory or of a name that the system refuses; else empty."""
+    if _out_of_memory(error):
+        return "out of memory; free some, or use a smaller source or config"
+    if isinstance(error, OSError) and error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+        return f"{str(error.filename)[:100]}: {error.strerror}; choose another name"
+    if str(error).startswith("Symlink loop"):  # what pathlib makes of ELOOP
+        return f"{error}; choose another name"
+    return ""
+
+
 def _out_of_memory(error: BaseException) -> bool:
     """Return whether torch, OpenCV or Python were refused memory."""
     text = str(error).lower()
@@ -208,7 +220,8 @@ def main(argv: list[str] | None = None) -> int:
         complain(command, "a file or a value is nested too deeply; expected a few levels")
         return USER_ERROR
     except Exception as error:
-        if not _out_of_memory(error):
+        mistake = _mistake(error)
+        if not mistake:
             raise
-        complain(command, "out of memory; free some, or use a smaller source or config")
+        complain(command, mistake)
         return USER_ERROR

@@ -13,9 +13,15 @@ USER_ERROR = 2
 REFUSED = 3
 
 
+_LONGEST = 4000
+
+
 def complain(command: str, text: str) -> None:
     """Print one line of error to stderr; what is not printable is escaped."""
-    print(printable(f"neuroslam {command}: {text}"), file=sys.stderr)
+    line = printable(f"neuroslam {command}: {text}")
+    if len(line) > _LONGEST:  # a name in an archive can have millions of characters
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    print(line, file=sys.stderr)
 
 
 def say(what: object) -> None:

@@ -13,6 +13,7 @@ FASTEST_ROBOT_M_S = 50.0
 FASTEST_ANIMAL_M_S = 3.0
 
 _FASTEST_TURN_RAD_S = 10.0
+_SHORTEST_STEP_S = 1e-4  # ten thousand frames a second
 _FEW = 0.01  # share of the frames that are single jumps, not a unit
 _JUMP = 10.0  # times the usual speed
 _LEAST_M_S = 1.0  # speed of a jump below the limit
@@ -53,6 +54,12 @@ def unit_warnings(trace: Mapping[str, np.ndarray], animal: bool) -> list[str]:
     if not len(speed):
         return []
     warnings = _speeds(trace, speed, dt, animal)
+    step_s = float(np.median(dt[1:])) if len(dt) > 1 else _SHORTEST_STEP_S
+    if 0.0 < step_s < _SHORTEST_STEP_S:
+        warnings.append(
+            f"times advance by {step_s:.3g} s a frame; expected at least {_SHORTEST_STEP_S:g} s: "
+            "are they in days, hours or minutes?"
+        )
     turn = float(np.quantile(np.abs(trace["w_rad_s"]), 0.95))
     if turn > _FASTEST_TURN_RAD_S and not animal:  # the heading of a tracked animal is noisy
         warnings.append(

@@ -104,8 +104,10 @@ def settle(out: Path) -> None:
 
     Raises:
         RunError: If a save cannot be finished: the folder cannot be written, or another process
-            has been saving for ten seconds.
+            has been saving for ten seconds; or if the folder holds a device or a pipe, which would
+            be read for ever.
     """
+    _refuse_devices(out)
     late = time.monotonic() + _WAIT_S
     while any(os.path.lexists(out / name) for name in (COMMITTED, STAGED, LOCK)):
         try:
@@ -125,6 +127,13 @@ def settle(out: Path) -> None:
         if time.monotonic() > late:
             raise RunError(f"{out}: another process is saving there; try again later")
         time.sleep(0.005)
+
+
+def _refuse_devices(out: Path) -> None:
+    with contextlib.suppress(OSError), os.scandir(out) as entries:
+        for entry in entries:
+            if not (entry.is_file() or entry.is_dir()) and os.path.exists(entry.path):
+                raise RunError(f"{entry.path}: is a device or a pipe; expected a regular file")
 
 
 @contextlib.contextmanager

@@ -45,7 +45,7 @@ class ImageFile(NamedTuple):
             return file.read(self.size)
 
 
-def read_tar(path: Path, wanted: Callable[[str], bool]) -> list[ImageFile]:
+def read_tar(path: Path, wanted: Callable[[str], bool]) -> tuple[list[ImageFile], int]:
     """List the files of a tar that are wanted; nothing is unpacked to disk.
 
     Those of a plain tar are read in place; those of a compressed tar are kept in memory.
@@ -53,6 +53,9 @@ def read_tar(path: Path, wanted: Callable[[str], bool]) -> list[ImageFile]:
     Args:
         path: The archive.
         wanted: Called with the name of a file, without folders.
+
+    Returns:
+        The files, and how many wanted members are links or devices, which are left out.
 
     Raises:
         SourceError: If the archive is damaged or incomplete, or its files take too much memory.
@@ -77,8 +80,8 @@ def read_tar(path: Path, wanted: Callable[[str], bool]) -> list[ImageFile]:
 
 def _members(
     path: Path, wanted: Callable[[str], bool], stream: IO[bytes] | None
-) -> list[ImageFile]:
-    """List the files of a tar that are wanted.
+) -> tuple[list[ImageFile], int]:
+    """List the files of a tar that are wanted, and count those that are none.
 
     Args:
         path: The archive.
@@ -89,11 +92,14 @@ def _members(
         NotReadableError: If a member is sparse, or they take more memory than the budget.
     """
     found: dict[str, ImageFile] = {}
-    needed = 0
+    needed = left_out = 0
     with tarfile.open(path, "r:", stream) as tar:
         for member in tar:
             tar.members = []  # type: ignore[attr-defined] - it would keep all of them
-            if not (member.isreg() and wanted(member.name.rpartition("/")[2])):
+            if member.isdir() or not wanted(member.name.rpartition("/")[2]):
+                continue
+            if not member.isreg():
+                left_out += 1
                 continue
             if member.issparse() or member.size > MOST_FILE_BYTES:
                 what = "is sparse" if member.issparse() else f"has {size_text(member.size)}"
@@ -107,7 +113,7 @@ def _members(
             content = None if stream is None else tar.extractfile(member)
             data = None if content is None else content.read()
             found[member.name] = ImageFile(member.name, path, member.offset_data, member.size, data)
-    return list(found.values())
+    return list(found.values()), left_out
 
 
 @contextmanager

@@ -292,10 +292,12 @@ def open_folder(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Im
     Raises:
         SourceError: If it contains no images, or its times or motion cannot be used.
     """
-    files = {file.name: file for file in path.iterdir() if file.is_file()}
+    names = {file.name: file for file in path.iterdir()}
+    files = {name: file for name, file in names.items() if file.is_file()}
+    left_out = sum(map(is_image_name, names.keys() - files.keys()))
     images = [ImageFile(name, file) for name, file in files.items() if is_image_name(name)]
     notes = {name: read_text(file) for name, file in files.items() if name in _NOTES}
-    return _with_notes(str(path), images, notes, frame_rate_hz, grey)
+    return _with_notes(str(path), images, notes, frame_rate_hz, grey, left_out)
 
 
 def open_tar(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
@@ -307,14 +309,14 @@ def open_tar(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Image
     Raises:
         SourceError: If the tar is damaged or contains no images.
     """
-    members = read_tar(path, lambda name: is_image_name(name) or name in _NOTES)
+    members, left_out = read_tar(path, lambda name: is_image_name(name) or name in _NOTES)
     images = [member for member in members if is_image_name(member.name)]
     notes = {
         note: to_text(member.read(), f"{path}: {member.name}")
         for member in members
         if (note := member.name.rpartition("/")[2]) in _NOTES
     }
-    return _with_notes(str(path), images, notes, frame_rate_hz, grey)
+    return _with_notes(str(path), images, notes, frame_rate_hz, grey, left_out)
 
 
 def open_image_list(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
@@ -429,6 +431,7 @@ def _with_notes(
     notes: dict[str, str],
     frame_rate_hz: float,
     grey: GreyRule,
+    left_out: int = 0,
 ) -> ImageSource:
     if not images:
         raise SourceError(
@@ -438,6 +441,9 @@ def _with_notes(
     times_s, found = None, ()
     if file is not None:
         times_s, found = parse_times(notes[file], f"{name}: {file}")
+    if left_out:
+        what = counted(left_out, "image is", "images are")
+        found = (*found, f"{name}: {what} left out: a link or no regular file")
     motion = notes.get("odometry.csv")
     return ImageSource(
         name,

@@ -271,6 +271,7 @@ def parse_table(
     if missing:
         raise SourceError(
             f"{name}: has the columns {','.join(lowered)[:100]}, but no {missing[0]}; {expected}"
+            + _separator_note(header)
         )
     if not numbered:
         raise SourceError(f"{name}: has a header, but no lines; expected one line per frame")
@@ -314,6 +315,14 @@ def parse_table(
         table["time_s"], found = _as_seconds(table["time_s"], rest, time, name)
         notes = (*found, *notes)
     return Table(table, rows, notes)
+
+
+def _separator_note(header: list[str]) -> str:
+    """Return what to do about a header that other characters than commas separate."""
+    for mark, what in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+        if len(header) == 1 and len(header[0].strip().split(mark)) > 1:
+            return f"; its columns are separated by {what}: write commas, and points in numbers"
+    return ""
 
 
 def _header_and_rows(text: str, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:

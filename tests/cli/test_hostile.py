@@ -387,3 +387,26 @@ def test_a_brain_that_has_seen_less_than_no_frames_is_refused(
 
 def test_assignments_still_give_what_they_say():
     assert parse_assignment("view.threshold=0.04") == {"view": {"threshold": 0.04}}
+
+
+# --- names and files that the system refuses ------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "d/" * 3000, "loop"])
+@pytest.mark.parametrize("command", ["run", "verify"])
+def test_a_folder_that_cannot_be_named_is_one_line(name, command, mistake, tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    words = ("run", WORLD, "--stop", "3", QUICK, "-o") if command == "run" else (command,)
+    line = mistake(*words, tmp_path / name)
+    assert len(line) < 4500
+
+
+@pytest.mark.parametrize("name", ["brain.safetensors", "frames.csv", "trace.f64", "manifest.json"])
+@pytest.mark.parametrize("command", ["verify", "report", "resume", "inspect"])
+def test_a_pipe_in_a_folder_from_elsewhere_is_not_waited_for(
+    name, command, finished, tmp_path, mistake
+):
+    out = shutil.copytree(finished, tmp_path / "o")
+    (out / name).unlink()
+    os.mkfifo(out / name)
+    assert "is a device or a pipe; expected a regular file" in mistake(command, out)

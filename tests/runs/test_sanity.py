@@ -96,3 +96,9 @@ def test_one_camera_alone_has_an_arbitrary_unit_everywhere(tmp_path, call):
     assert "arbitrary unit" in planned
     assert " m," not in planned
     assert "warning" not in alone.err
+
+
+def test_times_in_days_are_told_by_their_step():
+    days = trace() | {"dt_s": np.full(N, DT_S / 86400.0)}
+    (line,) = unit_warnings(days, animal=False)
+    assert line.startswith("times advance by 1.16e-06 s a frame; expected at least 0.0001 s")

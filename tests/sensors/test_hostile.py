@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import os
 import struct
 import tarfile
 import zipfile
@@ -373,3 +374,35 @@ def test_the_given_drive_of_50_frames_is_read_whole(cases):
     frames = list(open_source(cases / "kidnap_false_alarm" / "frames.tar.gz"))
     assert [f.index for f in frames] == list(range(50))
     assert len({f.image.shape for f in frames}) == 1
+
+
+# --- links and separators ------------------------------------------------------------------------
+
+
+def test_links_of_an_archive_are_left_out_and_counted(tmp_path):
+    with tarfile.open(tmp_path / "a.tar", "w") as tar:
+        for k, kind in enumerate((tarfile.REGTYPE, tarfile.SYMTYPE, tarfile.LNKTYPE)):
+            data = encoded(".png", picture(k)) if kind == tarfile.REGTYPE else b""
+            info = tarfile.TarInfo(f"{k}.png")
+            info.type, info.size, info.linkname = kind, len(data), "/etc/passwd"
+            tar.addfile(info, io.BytesIO(data))
+    source = open_source(tmp_path / "a.tar")
+    assert source.n_frames == 1
+    assert "2 images are left out: a link or no regular file" in "".join(source.notes)
+
+
+def test_pipes_and_broken_links_of_a_folder_are_left_out_and_counted(tmp_path):
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "0.png").write_bytes(encoded(".png", picture(0)))
+    os.mkfifo(tmp_path / "f" / "1.png")
+    (tmp_path / "f" / "2.png").symlink_to("nowhere")
+    source = open_source(tmp_path / "f")
+    assert source.n_frames == 1
+    assert "2 images are left out" in "".join(source.notes)
+
+
+@pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs"), (" ", "spaces")])
+def test_a_table_with_other_separators_is_refused_by_their_name(mark, name, tmp_path):
+    rows = ["time_s,v_m_s,w_rad_s", "0.0,1.0,0.0", "0.1,1.0,0.0"]
+    (tmp_path / "m.csv").write_text("\n".join(rows).replace(",", mark))
+    assert f"its columns are separated by {name}: write commas" in refusal(tmp_path / "m.csv")
