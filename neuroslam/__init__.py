@@ -6,21 +6,28 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuroslam.brain import NavigationBrain, load_brain, save_brain
     from neuroslam.config import BrainConfig
+    from neuroslam.runs.activity import record
     from neuroslam.runs.run import run
     from neuroslam.sensors import open_source
+    from neuroslam.state.activity import ActivityLog
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "ActivityLog": "neuroslam.state.activity",
     "NavigationBrain": "neuroslam.brain",
     "load_brain": "neuroslam.brain",
     "save_brain": "neuroslam.brain",
     "BrainConfig": "neuroslam.config",
     "open_source": "neuroslam.sensors",
+    "record": "neuroslam.runs.activity",
     "run": "neuroslam.runs.run",
 }
 
-__all__ = ["BrainConfig", "NavigationBrain", "load_brain", "open_source", "run", "save_brain"]
+__all__ = [
+    "ActivityLog", "BrainConfig", "NavigationBrain", "load_brain", "open_source", "record", "run",
+    "save_brain",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401

@@ -705,6 +705,10 @@ class HeadDirectionCells(Population):
         """Activity of every cell, 1 at the peak of a settled bump, ``([batch,] n)``."""
         return (self.activity / self.ring.peak).numpy(force=True)
 
+    def cell_properties(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the preferred direction of each cell."""
+        return {self.kind: {"preferred_rad": self.preferred_rad}}
+
     def counts(self) -> dict[str, float]:
         """Return the number of cells and of known views."""
         return {"head_direction_cells": self.config.n, "head_direction_views": self.views.n}

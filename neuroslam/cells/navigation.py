@@ -507,6 +507,44 @@ class NavigationCells(Population):
         parts = (self.boundary.rates, self.grid.rates)
         return np.concatenate([part.flatten().numpy(force=True) for part in parts])
 
+    def recorded(self) -> dict[str, np.ndarray]:
+        """Return the activity of the boundary, the grid and the place cells of one animal."""
+        if self.batch is not None:
+            return {}
+        if self._compiles() and self.place._near is None:
+            at, grid = self.oscillators.position_m.numpy(), self.grid.rates.numpy().reshape(-1)
+            felt = self.boundary.rates.numpy().reshape(-1)
+            place = self.place.responses_compiled(grid, at)
+            return {"boundary": felt, "grid": grid, "place": place}
+        rates = self.grid.rates.reshape(-1)
+        parts = {
+            "boundary": self.boundary.rates.reshape(-1),
+            "grid": rates,
+            "place": self.place.responses(rates, self.oscillators.position_m),
+        }
+        return {name: part.numpy(force=True) for name, part in parts.items()}
+
+    def cell_properties(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return bearing and distance of boundary cells, the spacings of grid cells, and centres.
+
+        The centres are those of place cells, in the frame of the cells.
+        """
+        angle, away = (
+            part.numpy(force=True).astype(np.float64)
+            for part in (self.boundary.preferred_rad, self.boundary.preferred_m)
+        )
+        spacing = np.asarray(self.config.grid_cells.spacings_m)
+        cells = self.grid.rates.numel() // len(spacing)
+        centres = self.place.graph()[0].numpy(force=True)
+        return {
+            "boundary": {
+                "bearing_rad": np.repeat(angle, len(away)),
+                "distance_m": np.tile(away, len(angle)),
+            },
+            "grid": {"spacing_m": np.repeat(spacing, cells)},
+            "place": {"centre_x_m": centres[:, 0], "centre_y_m": centres[:, 1]},
+        }
+
     def counts(self) -> dict[str, float]:
         """Return how much one animal has learnt, and for how long it was lost."""
         return {

@@ -7,7 +7,7 @@ and the merge of two sessions. After Kropff et al. (2015, *Nature* 523:
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple, Self, cast
+from typing import ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 import torch
@@ -239,6 +239,8 @@ class SpeedCells(Population):
     merge_rules = dict.fromkeys(
         ("rest_hz", "slope_hz_s_m", "lead_s", "smoothed_m_s", "rates_hz", "draws"), about_now
     )
+
+    rate_units: ClassVar[Mapping[str, str]] = {"speed": "Hz"}
 
     rates_hz: Tensor
     smoothed_m_s: Tensor

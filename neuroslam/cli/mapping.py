@@ -19,6 +19,8 @@ from neuroslam.cli.options import (
     Out,
     Overwrite,
     Preset,
+    Record,
+    RecordRate,
     RunFolder,
     SaveEvery,
     Source,
@@ -56,6 +58,8 @@ def run_command(
     truth: Truth = None,
     axes: Axes = None,
     offset: Offset = None,
+    record: Record = None,
+    rate: RecordRate = 20.0,
     start: Start = 0,
     stop: Stop = None,
     on_bad_frame: BadFrame = OnBadFrame.stop,
@@ -65,9 +69,12 @@ def run_command(
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
     from neuroslam.brain import read_checkpoint
+    from neuroslam.runs.activity import parse_record
     from neuroslam.runs.files import brain_file
     from neuroslam.runs.run import resolve_config, run
 
+    if record is not None:
+        parse_record(record)  # before the source is read
     if confirm is not None:
         assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
     base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
@@ -94,6 +101,8 @@ def run_command(
             on_step=on_step,
             on_start=on_start,
             save_every_s=save_every,
+            record=False if record is None else parse_record(record) or True,
+            record_rate_hz=rate,
         )
     return _report(summary, out, "run")
 

@@ -77,6 +77,17 @@ Offset = Annotated[
         "rates.",
     ),
 ]
+Record = Annotated[
+    str | None,
+    typer.Option(
+        metavar="cells[=POPULATION,...]",
+        help="Record the activity of all cells over time, or of some populations.",
+    ),
+]
+RecordRate = Annotated[
+    float,
+    typer.Option("--rate", metavar="HZ", min=1e-6, help="Samples a second of --record."),
+]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
 ConfigFile = Annotated[

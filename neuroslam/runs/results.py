@@ -33,6 +33,7 @@ from neuroslam.runs.reading import (
 )
 from neuroslam.runs.sanity import is_animal, unit_warnings
 from neuroslam.runs.saves import Folder
+from neuroslam.state.activity import ACTIVITY
 from neuroslam.state.answers import RUN_FIGURES, counts_of, gathered, tables_of
 
 
@@ -119,8 +120,9 @@ class RunSaver:
         write_text(staged / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
         save_brain(brain, staged / "brain.safetensors")
         write_manifest(staged, self.rows())
-        stale = {*run_files(out), "events"}
-        self.folder.commit(stale.difference((*ROWS, "events") if self.rows_in == out else ()))
+        growing = ("events", ACTIVITY)
+        stale = {*run_files(out), *growing}
+        self.folder.commit(stale.difference((*ROWS, *growing) if self.rows_in == out else ()))
         self.rows_in = out
 
 

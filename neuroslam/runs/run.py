@@ -1,5 +1,6 @@
 """A run: a brain maps a source, and the files of the run are written meanwhile."""
 
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from neuroslam.config import (
 )
 from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
 from neuroslam.interrupts import noting_interrupts
+from neuroslam.runs.activity import ActivityRecorder, Recorders
 from neuroslam.runs.clocks import resolve_offset
 from neuroslam.runs.files import (
     OnBadFrame,
@@ -41,6 +43,8 @@ from neuroslam.sensors.axes import parse_axes
 from neuroslam.sensors.landmarks import LandmarkWords, read_landmarks
 from neuroslam.sensors.open import absolute_spec
 from neuroslam.spiking.semantic import SemanticCells
+from neuroslam.state.activity import ACTIVITY, DEFAULT_RATE_HZ
+from neuroslam.state.activity_writer import ActivityWriter
 from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.types import Frame, StepResult
 
@@ -112,6 +116,8 @@ def run(
     on_start: Callable[[int | None], None] | None = None,
     features: nn.Module | None = None,
     save_every_s: float = SAVE_EVERY_S,
+    record: bool | Sequence[str] = False,
+    record_rate_hz: float = DEFAULT_RATE_HZ,
 ) -> RunSummary:
     """Map a source and write the files of the run into a folder.
 
@@ -140,6 +146,9 @@ def run(
         features: Network that computes views, if ``config.view.features`` is ``"module"``.
         save_every_s: Wall-clock seconds between two saves of the brain, from which a killed run can
             be resumed; 0: only at the end.
+        record: Write the activity of all cells, or of these populations, into ``activity.zarr``,
+            which :meth:`neuroslam.ActivityLog.open` reads.
+        record_rate_hz: Samples of it a second.
 
     Returns:
         Summary of the run. A bad frame under ``stop`` ends the run; its files are still written,
@@ -199,7 +208,13 @@ def run(
             earlier = any((out / name).exists() for name in run_files(out))
             save = RunSaver(folder, folder.staged if earlier else out)
             with RowWriter.create(save.rows_in) as output:
-                recorder = _recorder(save, tensorboard)
+                writer = None
+                if record:
+                    only = None if isinstance(record, bool) else record
+                    about = {"source": plan.source, "cells": list(config.cells)}
+                    log_in = _emptied(save.rows_in / ACTIVITY)
+                    writer = ActivityWriter(log_in, record_rate_hz, only, about)
+                recorder = _recorder(save, tensorboard, writer)
                 due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
                 steps = chain([first], steps)
                 _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
@@ -278,7 +293,10 @@ def resume(
             RowWriter.reopen(out, seen) as output,
         ):
             steps = _steps(brain, opened, onward, summary)
-            recorder = _recorder(save, tensorboard)
+            writer = None
+            if (out / ACTIVITY).is_dir():
+                writer = ActivityWriter.reopen(out / ACTIVITY, brain.clock.frame)
+            recorder = _recorder(save, tensorboard, writer)
             due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
             _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
             _end(brain, plan, summary)
@@ -286,8 +304,15 @@ def resume(
             return write_results(brain, plan, save, summary)
 
 
-def _recorder(save: RunSaver, tensorboard: bool) -> Recorder:
-    return TensorBoardRecorder(save.rows_in / "events") if tensorboard else NullRecorder()
+def _recorder(save: RunSaver, tensorboard: bool, activity: ActivityWriter | None) -> Recorder:
+    events = TensorBoardRecorder(save.rows_in / "events") if tensorboard else NullRecorder()
+    return events if activity is None else Recorders([events, ActivityRecorder(activity)])
+
+
+def _emptied(folder: Path) -> Path:
+    """Return a folder from which what an earlier run left behind is removed."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return folder
 
 
 def _note_source(summary: RunSummary, source: Source) -> None:

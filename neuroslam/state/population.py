@@ -181,6 +181,7 @@ class Population(Mergeable):
             odometry and relaxes; else by position after them, on a map that shows its own cells.
         needs_views: The brain makes views of its pictures.
         compass: ``uses`` the compass; ``corrects``: tells the others what it says, too.
+        rate_units: Unit of the activity that is recorded under a name; "1" where none is given.
     """
 
     kind: ClassVar[str] = ""
@@ -192,6 +193,7 @@ class Population(Mergeable):
     relaxes_map: ClassVar[bool] = False
     needs_views: ClassVar[bool] = False
     compass: ClassVar[Literal["ignores", "uses", "corrects"]] = "ignores"
+    rate_units: ClassVar[Mapping[str, str]] = {}
 
     @classmethod
     def build(cls, config: BrainConfig, leader: "type[Population]") -> Self:
@@ -277,6 +279,22 @@ class Population(Mergeable):
     def rates(self) -> np.ndarray | None:
         """Activity of the cells in a fixed order, ``(n_cells,)``; ``None``: nothing to record."""
         return None
+
+    def recorded(self) -> Mapping[str, np.ndarray]:
+        """Return the activity to record by name, each ``(n_cells,)``, in a fixed order.
+
+        Cells that are recruited are appended. The default is :attr:`rates` under the kind; a
+        population that holds several kinds of cells names each. The arrays are copied at once.
+        """
+        rates = self.rates
+        return {} if rates is None else {self.kind: rates}
+
+    def cell_properties(self) -> Mapping[str, Mapping[str, np.ndarray]]:
+        """Return what each recorded cell is tuned to: columns ``(n_cells,)`` by recorded name.
+
+        The name of a column ends with its unit, as ``preferred_rad``.
+        """
+        return {}
 
     def counts(self) -> dict[str, float]:
         """Return what was learnt, in numbers: ``metrics.json``, ``inspect``, reports of merges."""

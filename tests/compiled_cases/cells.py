@@ -20,7 +20,7 @@ from neuroslam.cells.head_direction import (
 )
 from neuroslam.cells.interference import OscillatoryInterference
 from neuroslam.cells.oscillators import VelocityOscillators
-from neuroslam.cells.place import CompetitiveHebbianPlaceCells
+from neuroslam.cells.place import CompetitiveHebbianPlaceCells, place_response
 from neuroslam.cells.sheet import SheetParameters, _waves, relax_step, sheet_step, sheet_weights
 from neuroslam.cells.speed import SpeedCells
 from neuroslam.cells.walls import WallMemory
@@ -138,6 +138,23 @@ def place_cells(rng):
         winner, recruited = theirs.compete_compiled(rates, at, 0.1, learns)
         pairs += [(here.winner.numpy(), np.array(winner)), (here.recruited, np.array(recruited))]
     return pairs + states(ours, theirs)
+
+
+@case("cells.place.responses_step")
+@torch.inference_mode()
+def place_cell_responses(rng):
+    config = PlaceCellConfig()
+    cells = CompetitiveHebbianPlaceCells(config, n_grid=26)
+    waves = rng.normal(0.0, 3.0, (26, 2))
+    for _ in range(12):
+        at = rng.uniform(-0.6, 0.6, 2)
+        grid = torch.from_numpy(np.maximum(np.cos(waves @ at), 0.0).astype(np.float32))
+        cells(grid, torch.from_numpy(at), 0.1)
+    n = int(cells.n_cells)
+    away = (cells.centres_m[:, :n] - torch.from_numpy(at)).square().sum(-1).float()
+    unit = torch.nn.functional.normalize(grid, dim=0)
+    said = place_response(cells.weights[:, :n], away, unit, config.power, config.continuity_m)[0]
+    return [(said.numpy(), cells.responses(grid, torch.from_numpy(at)).numpy())]
 
 
 @case("cells.walls.move_step", "cells.walls.predict_step", "cells.walls.correct_step",
