@@ -293,16 +293,16 @@ def responses_step(
 ) -> np.ndarray:  # fmt: skip
     """Do as :func:`place_response` for all cells of one animal; those far away respond with 0."""
     out = np.zeros(n_cells[0], np.float32)
-    rates, square = grid.reshape(-1), np.float32(0.0)
+    rates, square = grid.reshape(-1).astype(np.float64), 0.0
     for k in range(rates.size):
         square += rates[k] * rates[k]
-    scale = np.float32(1.0) / max(np.sqrt(square), np.float32(1e-12))
+    scale = 1.0 / max(math.sqrt(square), 1e-12)
     for j in range(out.size):
         dx, dy = centres_m[0, j, 0] - position_m[0], centres_m[0, j, 1] - position_m[1]
         near = (dx * dx + dy * dy) * (-0.5 / continuity_m**2)
         if near < -18.0:  # six standard deviations: less than 2e-8
             continue
-        a = b = c = d = np.float32(0.0)  # four sums at a time, which the processor does at once
+        a = b = c = d = 0.0  # four sums at a time, which the processor does at once
         w, last = weights[0, j], rates.size - rates.size % 4
         for k in range(0, last, 4):
             a += w[k] * rates[k]

@@ -116,7 +116,7 @@ def record(
     Example:
         >>> log = record("arena:square?minutes=0.1", only=["grid"])
         >>> log["grid"].shape, log.position_m.shape
-        ((121, 168), (121, 2))
+        ((121, 96), (121, 2))
     """
     from neuroslam.brain.brain import NavigationBrain
 

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,6 @@ from neuroslam.geometry import TWO_PI
 
 if TYPE_CHECKING:
     import pynapple
-    import pynwb
     import xarray
 
     from neuroslam.state.activity import ActivityLog
@@ -68,13 +68,12 @@ def write_nwb(
 ) -> Path:
     """Write the log as a file of Neurodata Without Borders."""
     try:
-        import pynwb
-        from pynwb.behavior import CompassDirection, Position
-        from pynwb.file import Subject
+        pynwb: Any = import_module("pynwb")  # its types are made at run time
     except ImportError as error:
         raise _missing("pynwb", error) from None
+    behavior = pynwb.behavior
     about = dict(about)
-    subject = about.pop("subject", None) or Subject(
+    subject = about.pop("subject", None) or pynwb.file.Subject(
         subject_id="simulation",
         species="Rattus norvegicus",
         sex="U",
@@ -97,10 +96,12 @@ def write_nwb(
         behaviour = file.create_processing_module("behavior", "Path of the animal.")
         truth = "true" if log.has_truth else "estimated by the brain"
         behaviour.add(
-            Position(spatial_series=_spatial(log, "position", log.position_m, "meters", truth))
+            behavior.Position(
+                spatial_series=_spatial(log, "position", log.position_m, "meters", truth)
+            )
         )
         behaviour.add(
-            CompassDirection(
+            behavior.CompassDirection(
                 spatial_series=_spatial(log, "heading", log.heading_rad, "radians", truth)
             )
         )
@@ -120,23 +121,21 @@ def write_nwb(
     return path
 
 
-def _add_units(file: "pynwb.NWBFile", log: "ActivityLog", name: str, seed: int) -> None:
+def _add_units(file: Any, log: "ActivityLog", name: str, seed: int) -> None:  # noqa: ANN401
     if file.units is None:
-        from pynwb.misc import Units
-
         what = "Poisson spikes drawn from the activity of cells."
-        file.units = Units(name="units", description=what, resolution=_RESOLUTION_S)
+        file.units = import_module("pynwb.misc").Units(
+            name="units", description=what, resolution=_RESOLUTION_S
+        )
         file.add_unit_column("population", "Population of the cell.")
         file.add_unit_column("cell", "Number of the cell in its population.")
     drawn = log.spikes(name, seed)
-    end = float(log.time_s[-1]) if log.n_samples else 0.0
     order = np.argsort(drawn.cells, kind="stable")  # keeps the times of a cell rising
     edges = np.searchsorted(drawn.cells[order], np.arange(drawn.n_cells + 1))
     for cell in range(drawn.n_cells):
         times = drawn.times_s[order[edges[cell] : edges[cell + 1]]]
         if len(times):  # a unit is a cell that fired
-            observed = [[float(log.time_s[0]), max(end, float(times[-1]))]]
-            file.add_unit(spike_times=times, obs_intervals=observed, population=name, cell=cell)
+            file.add_unit(spike_times=times, population=name, cell=cell)
 
 
 def _timing(log: "ActivityLog") -> dict[str, Any]:
@@ -150,25 +149,17 @@ def _timing(log: "ActivityLog") -> dict[str, Any]:
     return {"timestamps": log.time_s}
 
 
-def _series(
-    log: "ActivityLog", name: str, data: np.ndarray, unit: str, what: str
-) -> "pynwb.TimeSeries":
-    import pynwb
-
-    return pynwb.TimeSeries(
+def _series(log: "ActivityLog", name: str, data: np.ndarray, unit: str, what: str) -> Any:  # noqa: ANN401
+    return import_module("pynwb").TimeSeries(
         name=name, data=_packed(data), unit=unit, description=what, **_timing(log)
     )
 
 
-def _spatial(
-    log: "ActivityLog", name: str, data: np.ndarray, unit: str, truth: str
-) -> "pynwb.behavior.SpatialSeries":
-    from pynwb.behavior import SpatialSeries
-
+def _spatial(log: "ActivityLog", name: str, data: np.ndarray, unit: str, truth: str) -> Any:  # noqa: ANN401
     frame = "(0, 0) is the origin of the arena" if log.has_truth else "(0, 0) is the start"
     if name == "heading":
         frame = "0 is along the x axis, counter-clockwise positive"
-    return SpatialSeries(
+    return import_module("pynwb.behavior").SpatialSeries(
         name=name,
         description=f"{name.capitalize()} of the animal, {truth}.",
         data=_packed(data),
@@ -179,9 +170,8 @@ def _spatial(
 
 
 def _packed(data: np.ndarray) -> Any:  # noqa: ANN401 - hdmf's wrapper of an array
-    from hdmf.backends.hdf5.h5_utils import H5DataIO
-
-    return H5DataIO(data, compression="gzip", compression_opts=4, chunks=True, shuffle=True)
+    packed = import_module("hdmf.backends.hdf5.h5_utils").H5DataIO
+    return packed(data, compression="gzip", compression_opts=4, chunks=True, shuffle=True)
 
 
 def _whole(log: "ActivityLog", name: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -151,10 +151,12 @@ def place_cell_responses(rng):
         grid = torch.from_numpy(np.maximum(np.cos(waves @ at), 0.0).astype(np.float32))
         cells(grid, torch.from_numpy(at), 0.1)
     n = int(cells.n_cells)
-    away = (cells.centres_m[:, :n] - torch.from_numpy(at)).square().sum(-1).float()
-    unit = torch.nn.functional.normalize(grid, dim=0)
-    said = place_response(cells.weights[:, :n], away, unit, config.power, config.continuity_m)[0]
-    return [(said.numpy(), cells.responses(grid, torch.from_numpy(at)).numpy())]
+    away = (cells.centres_m[:, :n] - torch.from_numpy(at)).square().sum(-1)
+    unit = torch.nn.functional.normalize(grid.double(), dim=0)
+    compiled = cells.responses(grid, torch.from_numpy(at))  # first: it completes the weights
+    weights = cells.weights[:, :n].double()
+    said = place_response(weights, away, unit, config.power, config.continuity_m)[0]
+    return [(said.float().numpy(), compiled.numpy())]
 
 
 @case("cells.walls.move_step", "cells.walls.predict_step", "cells.walls.correct_step",

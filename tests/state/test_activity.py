@@ -170,6 +170,8 @@ def test_xarray_and_pynapple_have_all_of_it(log):
     assert np.isfinite(turning.values).any()
 
 
+@pytest.mark.filterwarnings("ignore:.*have no duration:UserWarning")  # cells with one spike
+@pytest.mark.filterwarnings("ignore:divide by zero:RuntimeWarning")
 def test_an_nwb_file_has_nothing_to_mend_and_comes_back(log, tmp_path):
     pytest.importorskip("pynwb")
     nap = pytest.importorskip("pynapple")
