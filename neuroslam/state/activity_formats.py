@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -16,13 +16,72 @@ if TYPE_CHECKING:
     import pynapple
     import xarray
 
-    from neuroslam.state.activity import ActivityLog
-
 _RESOLUTION_S = 1e-6  # of the times of spikes
 _SAME_STEP = 1e-6  # s: times that differ less from a constant rate are stored as that rate
 
 
-def to_xarray(log: "ActivityLog") -> "xarray.Dataset":
+class SpikeTrains(Protocol):
+    """Spikes of a population; see :class:`~neuroslam.state.activity.Spikes`."""
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Of all spikes, rising."""
+        ...
+
+    @property
+    def cells(self) -> np.ndarray:
+        """Number of the cell of each."""
+        ...
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        ...
+
+
+class Recorded(Protocol):
+    """What is used of an :class:`~neuroslam.state.activity.ActivityLog`."""
+
+    time_s: np.ndarray
+    speed_m_s: np.ndarray
+    estimate_m: np.ndarray
+    estimate_heading_rad: np.ndarray
+    rates: dict[str, np.ndarray]
+    units: dict[str, str]
+    cells: dict[str, dict[str, np.ndarray]]
+    about: dict[str, Any]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the populations."""
+        ...
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples."""
+        ...
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the position is the true one."""
+        ...
+
+    @property
+    def position_m(self) -> np.ndarray:
+        """Position of the animal."""
+        ...
+
+    @property
+    def heading_rad(self) -> np.ndarray:
+        """Heading of the animal."""
+        ...
+
+    def spikes(self, name: str, seed: int = 0, peak_hz: float = 20.0) -> SpikeTrains:
+        """Draw spikes."""
+        ...
+
+
+def to_xarray(log: "Recorded") -> "xarray.Dataset":
     """Return the log as a dataset: one variable a population, over ``time`` and its cells."""
     try:
         import xarray
@@ -47,7 +106,7 @@ def to_xarray(log: "ActivityLog") -> "xarray.Dataset":
     return xarray.Dataset(data, coordinates, plain)
 
 
-def to_pynapple(log: "ActivityLog") -> dict[str, "pynapple.TsdFrame | pynapple.Tsd"]:
+def to_pynapple(log: "Recorded") -> dict[str, "pynapple.TsdFrame | pynapple.Tsd"]:
     """Return the log as pynapple's time series by name."""
     try:
         import pynapple
@@ -64,7 +123,7 @@ def to_pynapple(log: "ActivityLog") -> dict[str, "pynapple.TsdFrame | pynapple.T
 
 
 def write_nwb(
-    log: "ActivityLog", path: Path, spikes: tuple[str, ...], seed: int, about: Mapping[str, Any]
+    log: "Recorded", path: Path, spikes: tuple[str, ...], seed: int, about: Mapping[str, Any]
 ) -> Path:
     """Write the log as a file of Neurodata Without Borders."""
     try:
@@ -121,7 +180,7 @@ def write_nwb(
     return path
 
 
-def _add_units(file: Any, log: "ActivityLog", name: str, seed: int) -> None:  # noqa: ANN401
+def _add_units(file: Any, log: "Recorded", name: str, seed: int) -> None:  # noqa: ANN401
     if file.units is None:
         what = "Poisson spikes drawn from the activity of cells."
         file.units = import_module("pynwb.misc").Units(
@@ -138,7 +197,7 @@ def _add_units(file: Any, log: "ActivityLog", name: str, seed: int) -> None:  # 
             file.add_unit(spike_times=times, population=name, cell=cell)
 
 
-def _timing(log: "ActivityLog") -> dict[str, Any]:
+def _timing(log: "Recorded") -> dict[str, Any]:
     """Return a constant rate where the samples have one, else the time of each."""
     steps = np.diff(log.time_s)
     if len(steps):
@@ -149,13 +208,13 @@ def _timing(log: "ActivityLog") -> dict[str, Any]:
     return {"timestamps": log.time_s}
 
 
-def _series(log: "ActivityLog", name: str, data: np.ndarray, unit: str, what: str) -> Any:  # noqa: ANN401
+def _series(log: "Recorded", name: str, data: np.ndarray, unit: str, what: str) -> Any:  # noqa: ANN401
     return import_module("pynwb").TimeSeries(
         name=name, data=_packed(data), unit=unit, description=what, **_timing(log)
     )
 
 
-def _spatial(log: "ActivityLog", name: str, data: np.ndarray, unit: str, truth: str) -> Any:  # noqa: ANN401
+def _spatial(log: "Recorded", name: str, data: np.ndarray, unit: str, truth: str) -> Any:  # noqa: ANN401
     frame = "(0, 0) is the origin of the arena" if log.has_truth else "(0, 0) is the start"
     if name == "heading":
         frame = "0 is along the x axis, counter-clockwise positive"
@@ -174,7 +233,7 @@ def _packed(data: np.ndarray) -> Any:  # noqa: ANN401 - hdmf's wrapper of an arr
     return packed(data, compression="gzip", compression_opts=4, chunks=True, shuffle=True)
 
 
-def _whole(log: "ActivityLog", name: str) -> Iterator[tuple[str, np.ndarray]]:
+def _whole(log: "Recorded", name: str) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the columns that say something of every cell of a population."""
     n = log.rates[name].shape[1]
     for column, values in log.cells.get(name, {}).items():
