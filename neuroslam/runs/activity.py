@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class ActivityRecorder(Recorder):
-    """Records the activity of a run's cells, see :class:`~neuroslam.state.activity.ActivityWriter`.
+    """Records the activity of a run's cells.
 
     Args:
-        writer: Of the log.
+        writer: The :class:`~neuroslam.state.activity_writer.ActivityWriter` of the log.
     """
 
     def __init__(self, writer: ActivityWriter) -> None:
@@ -103,7 +103,7 @@ def record(
     """Drive a brain along a source, and return the activity of all its cells.
 
     Args:
-        source: A source, or its name as :func:`neuroslam.open_source` takes it; or any frames.
+        source: A source, or its name for :func:`neuroslam.sensors.open_source`; or any frames.
         brain: A preset, a config, or a brain, which continues from the state that it has.
         rate_hz: Samples a second of the source's time, at most one a frame.
         only: Populations to record, as ``("grid", "place")``; ``None``: all.

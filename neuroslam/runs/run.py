@@ -147,7 +147,7 @@ def run(
         save_every_s: Wall-clock seconds between two saves of the brain, from which a killed run can
             be resumed; 0: only at the end.
         record: Write the activity of all cells, or of these populations, into ``activity.zarr``,
-            which :meth:`neuroslam.ActivityLog.open` reads.
+            which :meth:`~neuroslam.state.activity.ActivityLog.open` reads.
         record_rate_hz: Samples of it a second.
 
     Returns:

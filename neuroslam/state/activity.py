@@ -55,8 +55,9 @@ class ActivityLog:
     """Activity of every population over time, with where the animal was; read into memory.
 
     A population is a dense array of samples times cells, in an order that does not change; a cell
-    that was recruited during the run is 0 in the samples before. :func:`neuroslam.record` makes one
-    in Python, and ``neuroslam run ... --record cells`` writes one, which :meth:`open` reads.
+    that was recruited during the run is 0 in the samples before.
+    :func:`~neuroslam.runs.activity.record` makes one in Python, and ``neuroslam run ... --record
+    cells`` writes one, which :meth:`open` reads.
 
     Attributes:
         rates: Activity by population, ``(n_samples, n_cells)``, float32.
