@@ -151,7 +151,11 @@ class ExperienceMap(ExperienceGraph):
         turned = wrap_angle(s.facing_rad - relative_heading_rad - heading - facing[link])
         length[link], direction[link] = math.hypot(x, y), math.atan2(y, x)
         facing[link] = wrap_angle(facing[link] + gain * turned)
-        self._relaxation = None
+        if self._relaxation is not None:
+            measured = length[link], direction[link], facing[link]
+            self._relaxation.measure_again(link, *(value.item() for value in measured))
+        if self._solver is not None:
+            self._solver.measure_again(link, length[link], direction[link], facing[link])
         s.at_rest = 0
 
     def _undo(self, revoked: Revoked) -> None:

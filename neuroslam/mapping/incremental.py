@@ -126,6 +126,7 @@ class IncrementalSolver:
         self._measured, self._scale = np.empty((0, 3)), np.empty((0, 3))
         self._doubted, self._weights = np.empty(0, np.bool_), np.empty(0)
         self._following = np.empty(0, np.int64)
+        self._again: list[int] = []
         self._first, self._slot = np.empty(0, np.int64), np.empty(0, np.int64)
         doubts = np.zeros(len(source), np.bool_) if doubted is None else doubted
         columns = source, target, distance_m, heading_rad, facing_rad, doubts
@@ -168,6 +169,23 @@ class IncrementalSolver:
         for side, end in enumerate((source, target)):
             self._following[2 * k + side], self._first[end] = self._first[end], 2 * k + side
 
+    def measure_again(
+        self, link: int, distance_m: float, heading_rad: float, facing_rad: float
+    ) -> None:
+        """Replace the measurement of a link; the next update moves its ends.
+
+        Example:
+            >>> solver = IncrementalSolver(*(np.array([v]) for v in (0, 1, 1.0, 0.0, 0.0)))
+            >>> solver.measure_again(0, 3.0, 0.0, 0.0)
+            >>> poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+            >>> solver.update(poses, 1).rounds, poses[1].round(6).tolist()
+            (2, [3.0, 0.0, 0.0])
+        """
+        known = facing_rad == facing_rad
+        ahead, left = distance_m * np.cos(heading_rad), distance_m * np.sin(heading_rad)
+        self._measured[link] = ahead, left, facing_rad if known else 0.0
+        self._again.append(link)
+
     def solve(self, poses: np.ndarray) -> UpdateReport:
         """Solve the whole map in place: all poses but the first may move."""
         self.weigh(poses)
@@ -194,7 +212,8 @@ class IncrementalSolver:
             since: Number of links of the last update.
         """
         self._check(poses)
-        new = np.arange(since, self.n)
+        new = np.append(np.array(self._again, np.int64), np.arange(since, self.n))
+        self._again.clear()
         self._weigh(poses, new)
         contested = new[self._weights[new] < REJECTED]
         agreed = new[self._weights[new] >= REJECTED]

@@ -63,6 +63,10 @@ DENSE = 0.3
 """Share of links that alter their ends, above which a loop visits all links: that is cheaper."""
 
 
+COUNT_EVERY = 8
+"""Checks after which the links that alter an end are counted again, where all are visited."""
+
+
 @compiled
 def _differ(a: float, b: float) -> bool:
     """Return whether two numbers differ in a bit; a number that is none differs from itself."""
@@ -159,11 +163,48 @@ def _fused_loops(
 
 
 @compiled
+def links_at_poses(
+    source: np.ndarray, target: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """List the links of every pose; those that begin there follow each other.
+
+    Returns:
+        First link that begins at each pose, ``(n + 1,)``; first entry of each pose in the list of
+        links that end there, ``(n + 1,)``; and that list, ``(links,)``.
+    """
+    first, ending = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.int64)
+    for k in range(source.size):
+        first[source[k] + 1] += 1
+        ending[target[k] + 1] += 1
+    for i in range(n):
+        first[i + 1] += first[i]
+        ending[i + 1] += ending[i]
+    which, at = np.empty(source.size, np.int64), ending.copy()
+    for k in range(source.size):
+        which[at[target[k]]] = k
+        at[target[k]] += 1
+    return first, ending, which
+
+
+@compiled
+def _mark(
+    due: np.ndarray, i: int, first: np.ndarray, ending: np.ndarray, which: np.ndarray
+) -> None:
+    """Mark the links of a pose that has changed as due."""
+    for k in range(first[i], first[i + 1]):
+        due[k] = 1
+    for j in range(ending[i], ending[i + 1]):
+        due[which[j]] = 1
+
+
+@compiled
 def _tracked_loop(
     pose: np.ndarray,
-    changed_at: np.ndarray,
+    due: np.ndarray,
     along: np.ndarray,
-    clock: int,
+    first: np.ndarray,
+    ending: np.ndarray,
+    which: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
     distance_m: np.ndarray,
@@ -173,48 +214,58 @@ def _tracked_loop(
 ) -> int:
     """Relax once in place, links only that can alter something; return how many altered an end.
 
-    ``clock`` is the number of visits before this loop; the other arguments as of :func:`relax`.
+    A visit marks the links of the ends that it altered, its own among them: a later one is due in
+    this loop, an earlier one in the next. Arguments as of :func:`relax`.
     """
     n_links, n_turned, altered = source.size, 0, 0
-    which, bearing = np.empty(n_links, np.int64), np.empty(n_links)
+    of_position, of_heading = due[0], due[1]
+    words = due.view(np.uint64)  # eight links at a time, of which most often none is due
+    turned, bearing = np.empty(n_links, np.int64), np.empty(n_links)
     distance, along_x, along_y = np.empty(n_links), np.empty(n_links), np.empty(n_links)
-    for k in range(n_links):
-        s, t, facing = source[k], target[k], facing_rad[k]
-        since = clock + k - n_links  # the last visit of this link
-        if changed_at[1, s] >= since or changed_at[1, t] >= since:
+    for word in range(words.shape[1]):
+        if words[1, word] == 0:
+            continue
+        for k in range(8 * word, min(8 * word + 8, n_links)):
+            if of_heading[k] == 0:
+                continue
+            of_heading[k] = 0
+            s, t, facing = source[k], target[k], facing_rad[k]
             theta, to_theta = pose[s, 2], pose[t, 2]
-            which[n_turned], distance[n_turned] = k, distance_m[k]
+            turned[n_turned], distance[n_turned] = k, distance_m[k]
             bearing[n_turned] = theta + heading_rad[k]
             n_turned += 1
             if facing == facing:  # known
                 turn = correction * _turned(to_theta - theta - facing)
                 pose[s, 2], pose[t, 2] = theta + turn, to_theta - turn
                 if _differ(pose[s, 2], theta):
-                    changed_at[1, s] = clock + k
+                    _mark(of_heading, s, first, ending, which)
                     altered += 1
                 if _differ(pose[t, 2], to_theta):
-                    changed_at[1, t] = clock + k
+                    _mark(of_heading, t, first, ending, which)
     _displacements(bearing[:n_turned], distance[:n_turned], along_x[:n_turned], along_y[:n_turned])
     for j in range(n_turned):
-        k = which[j]
+        k = turned[j]
         if _differ(along_x[j], along[0, k]) or _differ(along_y[j], along[1, k]):
             along[0, k], along[1, k] = along_x[j], along_y[j]
-            s = source[k]  # so that this link is visited
-            changed_at[0, s] = max(changed_at[0, s], clock + k - n_links)
-    for k in range(n_links):
-        s, t = source[k], target[k]
-        since = clock + k - n_links
-        if changed_at[0, s] >= since or changed_at[0, t] >= since:
+            of_position[k] = 1
+    for word in range(words.shape[1]):
+        if words[0, word] == 0:
+            continue
+        for k in range(8 * word, min(8 * word + 8, n_links)):
+            if of_position[k] == 0:
+                continue
+            of_position[k] = 0
+            s, t = source[k], target[k]
             x, y, to_x, to_y = pose[s, 0], pose[s, 1], pose[t, 0], pose[t, 1]
             error_x = correction * (to_x - x - along[0, k])
             error_y = correction * (to_y - y - along[1, k])
             pose[s, 0], pose[s, 1] = x + error_x, y + error_y
             pose[t, 0], pose[t, 1] = to_x - error_x, to_y - error_y
             if _differ(pose[s, 0], x) or _differ(pose[s, 1], y):
-                changed_at[0, s] = clock + k
+                _mark(of_position, s, first, ending, which)
                 altered += 1
             if _differ(pose[t, 0], to_x) or _differ(pose[t, 1], to_y):
-                changed_at[0, t] = clock + k
+                _mark(of_position, t, first, ending, which)
     return altered
 
 
@@ -222,9 +273,12 @@ def _tracked_loop(
 def relax(
     poses: np.ndarray,
     pose: np.ndarray,
-    changed_at: np.ndarray,
+    due: np.ndarray,
     along: np.ndarray,
     counts: np.ndarray,
+    first: np.ndarray,
+    ending: np.ndarray,
+    which: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
     distance_m: np.ndarray,
@@ -237,36 +291,44 @@ def relax(
     """Relax in place, links in the order of visits; return the largest movement of the last loop.
 
     ``poses``, ``loops``, ``correction`` and ``tolerance`` are those of :meth:`Relaxation.run`, the
-    links those of :class:`Relaxation` in the order of visits. The rest is state: ``pose``, the
-    poses at the end of the last call, headings not wrapped; ``changed_at``, shape ``(2, n)``, the
-    visit that last altered the position and the heading of each; ``along``, shape ``(2, links)``,
-    the displacement of each link at its last visit; ``counts``, the visits so far, and how many
-    altered an end in the last loop that counted them.
+    links those of :class:`Relaxation` in the order of visits, and ``first``, ``ending`` and
+    ``which`` the result of :func:`links_at_poses`. The rest is state: ``pose``, the poses at the
+    end of the last call, headings not wrapped; ``due``, shape ``(2, links or more)``, whether the
+    position and the heading of an end of each link were altered since its last visit; ``along``,
+    shape ``(2, links)``, the displacement of each link at its last visit; ``counts``, how many
+    altered an end in the last loop that counted them, and for how many checks that holds where all
+    links are visited.
     """
     n, n_links, moved, loop = poses.shape[0], source.size, 0.0, 0
     for i in range(n):
         if _differ(pose[i, 0], poses[i, 0]) or _differ(pose[i, 1], poses[i, 1]):
-            changed_at[0, i] = counts[0]
+            _mark(due[0], i, first, ending, which)
         if _differ(pose[i, 2], poses[i, 2]):
-            changed_at[1, i] = counts[0]
+            _mark(due[1], i, first, ending, which)
     before = np.empty(pose.shape)
     _copy(pose, poses)
     while loop < loops:
         left = (loops - 1 - loop) % CHECK_EVERY  # loops until the next that is checked
-        if left > 0 and counts[1] > 2 * DENSE * n_links:
+        dense = counts[0] > 2 * DENSE * n_links
+        if left > 0 and dense:
             args = source, target, distance_m, heading_rad, facing_rad
             _fused_loops(pose, *args, left, correction)
-            counts[0] += left * n_links
-            changed_at[:] = counts[0]
+            due[:, :n_links] = 1
             loop += left
             left = 0
         if left == 0:
             _copy(before, pose)
-        counts[1] = _tracked_loop(
-            pose, changed_at, along, counts[0],
-            source, target, distance_m, heading_rad, facing_rad, correction,
-        )  # fmt: skip
-        counts[0] += n_links
+        if dense and counts[1] > 0:
+            args = source, target, distance_m, heading_rad, facing_rad
+            _fused_loops(pose, *args, 1, correction)
+            due[:, :n_links] = 1
+            counts[1] -= 1
+        else:
+            counts[0] = _tracked_loop(
+                pose, due, along, first, ending, which,
+                source, target, distance_m, heading_rad, facing_rad, correction,
+            )  # fmt: skip
+            counts[1] = COUNT_EVERY - 1
         loop += 1
         if left == 0:
             moved = 0.0
@@ -317,10 +379,12 @@ class Relaxation:
             heading_rad[order],
             facing_rad[order],
         )
+        self._numbers = order  # of the links as they were given
         self._pose = np.full((0, 3), np.nan)  # of no pose: all differ
-        self._changed_at = np.zeros((2, 0), np.int64)
+        self._due = np.ones((2, 8 * -(-len(order) // 8)), np.uint8)
         self._along = np.full((2, len(order)), np.nan)
-        self._counts = np.array([0, 2 * len(order)])
+        self._counts = np.array([2 * len(order), 0])
+        self._lists: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def add_link(
         self, source: int, target: int, distance_m: float, heading_rad: float, facing_rad: float
@@ -333,21 +397,41 @@ class Relaxation:
             >>> relaxation.run(np.zeros((3, 3)), loops=1, correction=0.5)[0][:, 0].tolist()
             [-0.5, -0.25, 0.75]
         """
+        n = len(self._numbers)
         at = int(np.searchsorted(self._links[0], np.uint64(source), side="right"))
         new = (np.uint64(source), np.uint64(target), distance_m, heading_rad, facing_rad)
         columns = [np.insert(c, at, v) for c, v in zip(self._links, new, strict=True)]
         self._links = columns[0], columns[1], columns[2], columns[3], columns[4]
+        self._numbers = np.insert(self._numbers, at, n)
         self._along = np.insert(self._along, at, np.nan, axis=1)
-        ends = [end for end in (source, target) if end < len(self._pose)]
-        self._changed_at[:, ends] = self._counts[0]
+        due = np.zeros((2, 8 * -(-(n + 1) // 8)), np.uint8)
+        due[:, : n + 1] = np.insert(self._due[:, :n], at, 1, axis=1)
+        self._due, self._lists = due, None
+
+    def measure_again(
+        self, number: int, distance_m: float, heading_rad: float, facing_rad: float
+    ) -> None:
+        """Replace the measurement of a link, by its number in the order in which links were given.
+
+        Example:
+            >>> relaxation = Relaxation(*(np.array([v]) for v in (0, 1, 1.0, 0.0, 0.0)))
+            >>> relaxation.measure_again(0, 3.0, 0.0, 0.0)
+            >>> relaxation.run(np.zeros((2, 3)), loops=1, correction=0.5)[0][:, 0].tolist()
+            [-1.5, 1.5]
+        """
+        at = int(np.flatnonzero(self._numbers == number)[0])
+        for column, value in zip(
+            self._links[2:], (distance_m, heading_rad, facing_rad), strict=True
+        ):
+            column[at] = value
+        self._due[:, at] = 1
 
     def _make_room(self, n: int) -> None:
         """Keep the state of the poses that there were before; others have changed."""
         more = n - len(self._pose)
         if more:
             self._pose = np.concatenate([self._pose, np.full((more, 3), np.nan)])
-            now = np.full((2, more), self._counts[0])
-            self._changed_at = np.concatenate([self._changed_at, now], axis=1)
+            self._lists = None
 
     def run(
         self, poses: np.ndarray, loops: int, correction: float, tolerance: float = 0.0
@@ -381,5 +465,7 @@ class Relaxation:
             return poses, moved
         solved = np.array(poses, dtype=np.float64, order="C")
         self._make_room(len(solved))
-        state = self._pose, self._changed_at, self._along, self._counts
+        if self._lists is None:
+            self._lists = links_at_poses(*self._links[:2], len(solved))
+        state = self._pose, self._due, self._along, self._counts, *self._lists
         return solved, relax(solved, *state, *self._links, loops, correction, tolerance)

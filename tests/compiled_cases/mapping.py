@@ -17,7 +17,7 @@ from neuroslam.mapping.sequence import advance_costs, within_links
 from tests.compiled_cases import case, with_and_without
 
 
-@case("mapping.relax.relax")
+@case("mapping.relax.relax", "mapping.relax.links_at_poses")
 def _loops_of_relaxation(draw):
     n, n_links = draw.integers(2, 40), draw.integers(1, 90)
     source = draw.integers(0, n, n_links)

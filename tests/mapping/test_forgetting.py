@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
 from neuroslam.brain.forgetting import forget, renumber, renumbering
-from neuroslam.brain.soundness import _faults
+from neuroslam.brain.soundness import faults_of
 from neuroslam.config import BrainConfig
 from neuroslam.errors import ConfigError, MapError
 from neuroslam.mapping import ExperienceMap
@@ -121,8 +121,7 @@ def brain(cells="pose", closure="view", **map_):
 
 
 def faults(robot):
-    own = {n: v for n, v in robot.state_dict().items() if not n.startswith("stored.")}
-    return list(_faults(own, robot.config))
+    return faults_of(robot.state_dict(), robot)
 
 
 def trace_of(frames, robot):
