@@ -161,6 +161,11 @@ def _mistake(error: BaseException) -> str:
         return "out of memory; free some, or use a smaller source or config"
     if isinstance(error, OSError) and error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
         return f"{str(error.filename)[:100]}: {error.strerror}; choose another name"
+    if isinstance(error, OSError) and error.filename is None:  # of no file: standard output
+        if error.errno in (errno.ENOSPC, errno.EBADF):
+            return f"what it prints cannot be written ({error.strerror})"
+        if isinstance(error, FileNotFoundError):
+            return "the current folder was removed; change to another"
     if str(error).startswith("Symlink loop"):  # what pathlib makes of ELOOP
         return f"{error}; choose another name"
     return ""

@@ -1,7 +1,9 @@
 """Names, configs and folders from elsewhere: one line, no escape, nothing opened unasked."""
 
 import csv
+import errno
 import http.server
+import io
 import json
 import os
 import re
@@ -410,3 +412,22 @@ def test_a_pipe_in_a_folder_from_elsewhere_is_not_waited_for(
     (out / name).unlink()
     os.mkfifo(out / name)
     assert "is a device or a pipe; expected a regular file" in mistake(command, out)
+
+
+def test_a_current_folder_that_was_removed_is_one_line(mistake, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    line = mistake("run", WORLD, "-o", "out", "--stop", "3", QUICK)
+    assert "the current folder was removed" in line
+
+
+class FullOutput(io.StringIO):
+    def write(self, _text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_output_to_a_full_disk_is_one_line(mistake, finished, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", FullOutput())
+    line = mistake("verify", finished)
+    assert "what it prints cannot be written (No space left on device)" in line
