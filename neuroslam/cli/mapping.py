@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from neuroslam.cli.options import (
+    ArenaOf,
     Assignments,
     Axes,
     BadFrame,
+    Columns,
     ConfigFile,
     Confirm,
     Landmarks,
@@ -23,10 +25,12 @@ from neuroslam.cli.options import (
     RecordRate,
     RunFolder,
     SaveEvery,
+    Smooth,
     Source,
     Start,
     Stop,
     Truth,
+    Units,
 )
 from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
 from neuroslam.cli.progress import show_frames
@@ -58,6 +62,10 @@ def run_command(
     truth: Truth = None,
     axes: Axes = None,
     offset: Offset = None,
+    columns: Columns = None,
+    units: Units = None,
+    arena: ArenaOf = None,
+    smooth: Smooth = None,
     record: Record = None,
     rate: RecordRate = 20.0,
     start: Start = 0,
@@ -73,6 +81,10 @@ def run_command(
     from neuroslam.runs.files import brain_file
     from neuroslam.runs.run import resolve_config, run
 
+    if any(option is not None for option in (columns, units, arena, smooth)):
+        from neuroslam.worlds.animal_tracks import track_spec
+
+        source = track_spec(source, columns, units, arena, smooth)
     if record is not None:
         parse_record(record)  # before the source is read
     if confirm is not None:

@@ -77,6 +77,29 @@ Offset = Annotated[
         "rates.",
     ),
 ]
+Columns = Annotated[
+    str | None,
+    typer.Option(
+        metavar="t=NAME,x=NAME,...",
+        help="Columns of an animal's track: t, x, y and hd (head direction); default: usual names.",
+    ),
+]
+Units = Annotated[
+    str | None,
+    typer.Option(metavar="UNITS", help="Units of an animal's track, as cm,deg,ms."),
+]
+ArenaOf = Annotated[
+    str | None,
+    typer.Option(
+        "--arena",
+        metavar="NAME",
+        help="Arena of an animal's track; hull: the outline of the track (the default); none.",
+    ),
+]
+Smooth = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", min=0.0, help="Smooth the positions of an animal's track."),
+]
 Record = Annotated[
     str | None,
     typer.Option(

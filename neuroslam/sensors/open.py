@@ -42,7 +42,7 @@ _KINDS = (
     "or a camera and motion as drive.avi+motion.csv"
 )
 _OFFSET = re.compile(r"(.*)[?&]offset=([+-]?[^&?+]*)", re.DOTALL)
-_PREFIXES = ("world:", "arena:", "camera:")
+_PREFIXES = ("world:", "arena:", "camera:", "track:")
 
 
 def open_source(
@@ -65,6 +65,7 @@ def open_source(
     ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
     ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
     ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)
+    ``track:rat.csv?units=cm,deg``      track of an animal (:mod:`neuroslam.worlds.animal_tracks`)
     ``arena:NAME``, ``arena:rat.npz``   walk with noisy senses (:mod:`neuroslam.worlds.senses`)
     ``drive.avi+motion.csv``            two sources merged by time: a camera and motion
                                         (:mod:`neuroslam.sensors.streams`); with ``?offset=S``, S
@@ -107,6 +108,10 @@ def open_source(
             from neuroslam.worlds.senses import open_arena
 
             return open_arena(spec)
+        if isinstance(spec, str) and spec.startswith("track:"):
+            from neuroslam.worlds.animal_tracks import open_animal_track
+
+            return open_animal_track(spec)
         if isinstance(spec, str) and spec.startswith("camera:"):
             return CameraSource(spec.removeprefix("camera:"), grey)
         path, topics = _bag_topics(str(spec))
@@ -199,6 +204,9 @@ def absolute_spec(spec: str) -> str:
         name, mark, query = spec.removeprefix("arena:").partition("?")
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
         return f"arena:{name}{mark}{query}"
+    if spec.startswith("track:"):
+        name, mark, query = spec.removeprefix("track:").partition("?")
+        return f"track:{Path(name).resolve()}{mark}{query}"
     if spec.startswith(_PREFIXES) or ("://" in spec and not Path(spec).exists()):
         return spec
     path, topics = _bag_topics(spec)
@@ -233,7 +241,7 @@ def seeded_spec(spec: str, seed: int) -> str:
     if parts := _parts(pair):
         whole = "+".join(seeded_spec(part, seed) for part in parts)
         return with_offset(whole, offset) if offset else whole
-    if not spec.startswith(_PREFIXES):
+    if not spec.startswith(_PREFIXES) or spec.startswith("track:"):
         return spec
     name, _, query = spec.partition("?")
     options = list(filter(None, query.split("&")))
@@ -275,6 +283,8 @@ def _opener(path: Path) -> Callable[[Path, float, GreyRule], Source]:
         return _open_table
     if name.endswith((".npz", ".npy")):
         return _open_positions
+    if name.endswith(".nwb"):
+        return _open_nwb
     what = "is a single image" if is_image_name(name) else "is of no known kind"
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
 
@@ -299,6 +309,13 @@ def _first_rows(text: str, n: int) -> Iterator[list[str]]:
     """Yield the first rows of a table, as far as they can be read."""
     with suppress(csv.Error):  # its reader says what is wrong
         yield from csv.reader(text[:100_000].splitlines()[:n])
+
+
+def _open_nwb(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
+    """Open the path of an animal in a file of Neurodata Without Borders."""
+    from neuroslam.worlds.animal_tracks import open_animal_track
+
+    return open_animal_track(f"track:{path}")
 
 
 def _open_positions(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
