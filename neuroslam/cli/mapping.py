@@ -72,6 +72,12 @@ def run_command(
     stop: Stop = None,
     on_bad_frame: BadFrame = OnBadFrame.stop,
     no_tensorboard: NoTensorboard = False,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write an MCAP file too, for Foxglove; needs the extra mcap."
+        ),
+    ] = None,
     save_every: SaveEvery = 60.0,
     overwrite: Overwrite = False,
 ) -> int:
@@ -109,6 +115,7 @@ def run_command(
             stop=stop,
             on_bad_frame=on_bad_frame.value,
             tensorboard=not no_tensorboard,
+            mcap=mcap,
             overwrite=overwrite,
             on_step=on_step,
             on_start=on_start,

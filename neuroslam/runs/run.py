@@ -111,6 +111,7 @@ def run(
     stop: int | None = None,
     on_bad_frame: OnBadFrame = "stop",
     tensorboard: bool = True,
+    mcap: str | Path | None = None,
     overwrite: bool = False,
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
@@ -140,6 +141,7 @@ def run(
         stop: Frame to stop before; default: the end.
         on_bad_frame: ``stop`` at an unusable frame, or ``skip`` and count it.
         tensorboard: Write ``events/`` too.
+        mcap: File to write for Foxglove, see :mod:`neuroslam.runs.mcap`; extra ``mcap``.
         overwrite: Replace the files of an earlier run in ``out``.
         on_step: Called after each frame with its result.
         on_start: Called once with the frame to stop before; ``None``: unknown.
@@ -215,6 +217,10 @@ def run(
                     log_in = _emptied(save.rows_in / ACTIVITY)
                     writer = ActivityWriter(log_in, record_rate_hz, only, about)
                 recorder = _recorder(save, tensorboard, writer)
+                if mcap is not None:
+                    from neuroslam.runs.mcap import McapRecorder
+
+                    recorder = Recorders([recorder, McapRecorder(Path(mcap))])
                 due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
                 steps = chain([first], steps)
                 _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
