@@ -13,7 +13,7 @@ from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, fi
 from neuroslam.state.files import load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> str:
@@ -51,6 +51,8 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         tensors = _with_compass(tensors, config)
     if about["format"] < 4:
         tensors = _without_unused(tensors, config)
+    if about["format"] < 6:
+        tensors = _beside_paths(tensors)
     return config, tensors
 
 
@@ -96,6 +98,12 @@ def _without_unused(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str
         for name, value in tensors.items()
         if not any(f"{part}." in f".{name}." for part in unused)
     }
+
+
+def _beside_paths(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Convert a state of formats up to 5, whose maps place the robot by odometry alone."""
+    maps = [name.removesuffix("current") for name in tensors if name.endswith("map.state.current")]
+    return tensors | {f"{one}on_path": torch.tensor(0) for one in maps}
 
 
 def _of_one_session(

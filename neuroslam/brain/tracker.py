@@ -301,6 +301,9 @@ class SequenceTracker(Mergeable):
             if s.proved >= _PROOF:
                 s.origin = NO_EXPERIENCE
         if self._confirmed(best, elsewhere[best], costs[here], around):
+            driven = int(s.way_m / max(_link_length(map_), 1e-9))
+            if around(current, 0, min(2 * driven + _APART, map_.n // 3))[best]:
+                return self._go("at", best, elsewhere[best], costs[here])  # it lagged behind
             return self._correct(best, elsewhere[best], costs[here], map_)
         jump = self._jumped(compared, around, current)
         if jump != NO_EXPERIENCE:
@@ -408,7 +411,7 @@ class SequenceTracker(Mergeable):
         return "link" if apart <= reach or not self.state.localised else "set"
 
     def _go(
-        self, kind: Literal["link", "set"], experience: int, cost: float, rival: float
+        self, kind: Literal["at", "link", "set"], experience: int, cost: float, rival: float
     ) -> Tracking:
         s = self.state
         s.bad = s.streak = s.doubts = s.jump_frames = 0

@@ -146,7 +146,7 @@ def _estimated(
 
     source, _ = resolve_offset(source, offset, settings)
     opened = open_source(source, settings.frame_rate_hz, settings.view.grey)
-    plain = settings.view.features == "grey" and not settings.view.orientations
+    plain = settings.view.features == "grey"
     if preset is None and not (plain and has_pictures(opened)):
         return settings, None
     automatic = resolve_config("auto", config, given)

@@ -77,6 +77,7 @@ class ExperienceMap(ExperienceGraph):
         """
         self.move(motion)
         action: Action = "none"
+        self.state.on_path = int(tracking is not None and tracking.kind in ("at", "link"))
         if tracking is not None:
             action = self._follow_sequence(view, cells, frame, tracking, kidnapped)
         elif view.template != NO_TEMPLATE:
@@ -114,6 +115,10 @@ class ExperienceMap(ExperienceGraph):
         """Create the experience of a new view, or go to that where the robot is localised."""
         if tracking.revoked is not None:
             self._undo(tracking.revoked)
+        elif tracking.kind == "leave" and self.current != NO_EXPERIENCE:
+            here = self.pose  # left near the last experience passed, not where it was seen last
+            self.state.current = self._along_links()[2]
+            self.set_pose(here)
         if view.is_new:
             self.create(view.template, cells, frame)
             return "create"

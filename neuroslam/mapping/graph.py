@@ -10,6 +10,7 @@ import torch
 from neuroslam.config import MapConfig
 from neuroslam.errors import MapError
 from neuroslam.geometry import compose_poses, rotate, wrap_angle
+from neuroslam.mapping.following import along_links
 from neuroslam.mapping.forgetting import contract_links, least_used
 from neuroslam.mapping.incremental import link_weights
 from neuroslam.mapping.joining import merge_maps
@@ -51,6 +52,8 @@ class MapState(Scalars):
         at_rest: 1 if relaxation has converged, else 0.
         session: Id of the session.
         made: Number of experiences that this session has made.
+        on_path: 1 while the robot follows the links, as its views show; 0: odometry alone places
+            it.
     """
 
     current: int
@@ -63,6 +66,7 @@ class MapState(Scalars):
     at_rest: int
     session: int
     made: int
+    on_path: int
 
     def __init__(self, initial_heading_deg: float) -> None:
         super().__init__(
@@ -76,6 +80,7 @@ class MapState(Scalars):
             at_rest=1,
             session=0,
             made=0,
+            on_path=0,
         )
 
 
@@ -151,7 +156,8 @@ class ExperienceGraph(Mergeable):
         if s.current == NO_EXPERIENCE:
             return Pose(s.dx_m, s.dy_m, s.facing_rad)
         x, y, _ = self.experiences.array("pose")[s.current].tolist()
-        return Pose(x + s.dx_m, y + s.dy_m, s.facing_rad)
+        dx, dy = self._displacement()
+        return Pose(x + dx, y + dy, s.facing_rad)
 
     @property
     def offset(self) -> Pose:
@@ -160,7 +166,7 @@ class ExperienceGraph(Mergeable):
         heading = 0.0
         if s.current != NO_EXPERIENCE:
             heading = self.experiences.array("pose")[s.current, 2].item()
-        dx, dy = rotate(s.dx_m, s.dy_m, -heading)
+        dx, dy = rotate(*self._displacement(), -heading)
         return Pose(dx, dy, wrap_angle(s.facing_rad - heading))
 
     def neighbours(self, experience: int) -> list[int]:
@@ -382,6 +388,19 @@ class ExperienceGraph(Mergeable):
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Place the partial experiences in the loaded map and reroute their links."""
         return merge_maps(loaded, partial, join)
+
+    def _displacement(self) -> tuple[float, float]:
+        """Return the displacement of the robot from the current experience, along the map."""
+        s = self.state
+        if not s.on_path or s.current == NO_EXPERIENCE:
+            return s.dx_m, s.dy_m
+        return self._along_links()[:2]
+
+    def _along_links(self) -> tuple[float, float, int]:
+        """Return the displacement of the robot if it followed the links, and where it passed."""
+        s = self.state
+        source, target = (self.links_table.array(name) for name in ("source", "target"))
+        return along_links(s.current, s.dx_m, s.dy_m, self.pose_table, source, target)
 
     def _linked(self, a: int, b: int) -> bool:
         source, target = (self.links_table.array(c) for c in ("source", "target"))

@@ -37,7 +37,7 @@ FIRST = 600
 MOST = 6000
 """Frames after which a drive that never revisits a place is taken as it is."""
 
-SHARE = 0.58
+SHARE = 0.42
 """Share of the mean match error of far frames that is the threshold."""
 
 _FEWEST = 100
@@ -161,7 +161,10 @@ def _moving(frames: list[Frame]) -> np.ndarray:
 
 def _section(view: ViewConfig, far: float, factor: int) -> dict[str, Any]:
     """Return the keys of a view for the source's pictures; the crop only where there is one."""
-    names = ("template_width", "template_height", "patch_radius", "shift_match", "normalisation")
+    names = (
+        "template_width", "template_height", "orientations", "patch_radius", "shift_match",
+        "normalisation",
+    )  # fmt: skip
     found = {name: getattr(view, name) for name in names} | {"threshold": _rounded(SHARE * far)}
     crop = _scaled(view.crop, factor)
     return found if crop is None else {"crop": crop, **found}
@@ -179,9 +182,11 @@ def _best_views(
         rows = round(top * height), round(bottom * height)
         whole = rows == (0, height)
         region = None if whole else (0, width, *rows)
-        lines = max(4, round(config.template_width * (rows[1] - rows[0]) / width))
-        view = config.model_copy(update={"crop": region, "template_height": lines})
-        view = fitting(view, pictures.shape[1:])
+        view = config.model_copy(update={"crop": region})
+        if not config.orientations:  # square pixels; cells of gradients need not be square
+            lines = max(4, round(config.template_width * (rows[1] - rows[0]) / width))
+            view = view.model_copy(update={"template_height": lines})
+            view = fitting(view, pictures.shape[1:])
         score, errors = _separation(pictures, view, near, far)
         found.append((score, view, *errors))
     best = found[-1]  # the whole image, unless another is clearly better
