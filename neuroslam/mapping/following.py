@@ -36,8 +36,10 @@ def along_links(
 
     Example:
         >>> corner = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
-        >>> along_links(0, 1.5, 0.1, corner, np.array([0, 1]), np.array([1, 2]))  # to the corner
-        (1.0, 0.5033296378372907, 1)
+        >>> ends = np.array([0, 1]), np.array([1, 2])
+        >>> x, y, passed = along_links(0, 1.5, 0.1, corner, *ends)  # round the corner
+        >>> round(x, 3), round(y, 3), passed
+        (1.0, 0.503, 1)
     """
     left_m = math.hypot(dx_m, dy_m)
     if not left_m:
