@@ -76,7 +76,7 @@ def next_day(
     Args:
         path: The stored map.
         goals: Number of goals, experiences of the first day.
-        start: Frame of the route where the robot wakes up; it is not told.
+        start: Frame of the route where the robot wakes up; it does not know it.
         on_event: Called with each event.
 
     Returns:

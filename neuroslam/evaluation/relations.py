@@ -111,7 +111,8 @@ def relation_errors(
     after = np.searchsorted(times_s, relations.times_s).clip(1, len(times_s) - 1)
     earlier = relations.times_s - times_s[after - 1] < times_s[after] - relations.times_s
     rows = after - earlier
-    known = (np.abs(times_s[rows] - relations.times_s) <= tolerance_s).all(axis=1)
+    near = np.abs(times_s[rows] - relations.times_s) <= tolerance_s
+    known = near[:, 0] & near[:, 1]
     if not known.any():
         raise RunError(
             f"none of {counted(len(known), 'relation')} has poses within {tolerance_s} s of its "

@@ -165,7 +165,11 @@ class LaserMapper:
             ]
             expected = relative_poses(frame, poses[new])
             got = KnownSurfaces(seen).register(
-                scan, Pose(*expected.tolist()), 0.5 * reach[target], 0.5 * TURN_RAD, reach_m=1.0
+                scan,
+                Pose(*expected.tolist()),
+                0.5 * float(reach[target]),
+                0.5 * TURN_RAD,
+                reach_m=1.0,
             )
             dx, dy, turn = relative_poses(expected, np.array(got.pose)).tolist()
             good = math.hypot(dx, dy) <= reach[target] and abs(turn) <= TURN_RAD

@@ -345,6 +345,9 @@ class SemanticCells(Population):
         if len(rows):
             most = len(KINDS) - 1
             yield f"words {listed(rows)}: kind {listed(kinds[rows])}, expected 0 to {most}"
+        owed_s, step_s = float(state["now.owed_s"]), config.semantic.time_step_s
+        if not -1e-3 * step_s <= owed_s <= 1.001 * step_s:  # of which a frame makes whole steps
+            yield f"now.owed_s: {owed_s} s, expected 0 to {step_s} s, the time of a step"
 
     @without_gradients
     def advance(

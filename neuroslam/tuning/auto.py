@@ -185,8 +185,7 @@ def _best_views(
         view = config.model_copy(update={"crop": region})
         if not config.orientations:  # square pixels; cells of gradients need not be square
             lines = max(4, round(config.template_width * (rows[1] - rows[0]) / width))
-            view = view.model_copy(update={"template_height": lines})
-            view = fitting(view, pictures.shape[1:])
+            view = fitting(view.model_copy(update={"template_height": lines}), pictures.shape[1:])
         score, errors = _separation(pictures, view, near, far)
         found.append((score, view, *errors))
     best = found[-1]  # the whole image, unless another is clearly better

@@ -12,7 +12,7 @@ from neuroslam.config import (
     parse_assignment,
     read_preset,
 )
-from neuroslam.config.sections import MapConfig
+from neuroslam.config.sections import MapConfig, region_in
 from neuroslam.tuning.auto import Estimates
 from neuroslam.tuning.drive import Drive
 from neuroslam.tuning.motion import FieldOfView, field_of_view, measure_shifts
@@ -69,10 +69,16 @@ def _rc_car(estimates: Estimates, drive: Drive) -> dict[str, Any]:
     values.pop("frame_rate_hz", None)
     if drive.size == _RC_CAR_PX:
         return values
-    size = ("crop", "template_width", "template_height")
-    view = {k: v for k, v in estimates.values.get("view", {}).items() if k in size}
-    values["view"] = {k: v for k, v in values["view"].items() if k != "crop"} | view
-    return values | {"odometry": estimates.values.get("odometry", {})}
+    view = {k: v for k, v in values["view"].items() if k != "crop"}
+    crop = estimates.values.get("view", {}).get("crop")
+    width, height = drive.size
+    if crop is not None:
+        x_min, x_max, y_min, y_max = region_in(crop, height, width)
+        width, height = x_max - x_min, y_max - y_min
+        view["crop"] = crop
+    square = max(4, round(view["template_width"] * height / width))
+    view["template_height"] = min(square, height)
+    return values | {"view": view, "odometry": estimates.values.get("odometry", {})}
 
 
 def _candidate(

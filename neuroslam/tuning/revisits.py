@@ -147,7 +147,12 @@ def differences_of(templates: np.ndarray, pairs: np.ndarray, shift: int) -> np.n
 
 
 def fitting(config: ViewConfig, shape: tuple[int, ...]) -> ViewConfig:
-    """Return the config with its template limited to the size of a picture."""
+    """Return the config with its template limited to the size of a picture.
+
+    Templates of gradients are not limited: their cells are made from an enlarged picture.
+    """
+    if config.orientations:
+        return config
     width, height = min(config.template_width, shape[1]), min(config.template_height, shape[0])
     return config.model_copy(update={"template_width": width, "template_height": height})
 

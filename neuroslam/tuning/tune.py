@@ -158,8 +158,8 @@ def _tune(
 ) -> Tuning:
     report("reading")
     plain = automatic(start, assignments)
-    made_once = plain.view.features != "grey" or plain.view.orientations > 0
-    encoder = view_encoder(plain.view, features) if made_once else None
+    network = plain.view.features != "grey"
+    encoder = view_encoder(plain.view, features) if network else None
     drive = read_drive(source, stop, encoder, start.view.grey)
     keys = key_frames(drive)
     report("finding revisits")

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from neuroslam.brain import NavigationBrain, load_brain, read_checkpoint, save_brain
 from neuroslam.brain.checkpoint import FORMAT_VERSION
-from neuroslam.brain.soundness import _expected, _fits, _surely_connected
+from neuroslam.brain.soundness import _expected, _fits, _surely_connected, faults_of
 from neuroslam.config import BrainConfig
 from neuroslam.errors import CheckpointError
 from neuroslam.mapping.tables import Links
@@ -244,6 +244,15 @@ def test_a_new_brain_is_found_sound_by_the_quick_check_and_no_altered_one(cells)
     assert not _fits(
         state | {"map.links_table.source": torch.zeros(1, dtype=torch.int64)}, expected
     )
+
+
+def test_time_that_no_step_has_taken_is_less_than_a_step():
+    values = {"cells": "semantic", "semantic": {"space": {"n_scales": 2, "n_rotations": 2}}}
+    brain = NavigationBrain(BrainConfig.model_validate(values))
+    state = dict(brain.state_dict())
+    assert not list(faults_of(state, brain))
+    altered = state | {"semantic.now.owed_s": torch.tensor(-1.0, dtype=torch.float64)}
+    assert any("now.owed_s: -1.0 s, expected 0 to" in fault for fault in faults_of(altered, brain))
 
 
 @pytest.mark.parametrize(

@@ -209,9 +209,7 @@ def test_two_real_laps_close(shared):
     source = shared / "data" / "usi_day2"
     with (source / "laps.csv").open(newline="") as file:
         phase = [int(row["lap"]) + float(row["phase"]) for row in csv.DictReader(file)]
-    config = resolve_config(
-        "auto", assignments=("view.crop=[0,160,0,60]", "view.template_height=15")
-    )
+    config = resolve_config("auto", assignments=("view.crop=[0,160,0,60]",))
     robot, sizes, frames = NavigationBrain(config), {}, 0
     for frame in open_source(source / "frames.tar", 20.0).frames(stop=900):
         result = robot(frame)

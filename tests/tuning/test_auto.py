@@ -50,7 +50,14 @@ def test_without_a_second_lap_the_field_of_view_stays():
 def test_the_band_with_the_wall_is_found():
     found = estimate(Wall(laps(2), 600), resolve_config("auto"))
     assert found.values["view"]["crop"] == (0, 80, 0, 40)
-    assert found.values["view"]["template_height"] == 20
+    assert found.values["view"]["template_height"] == 120  # 20 rows of 6 orientations
+
+
+def test_pixels_of_grey_views_are_square():
+    grey = ("view.orientations=0", "view.template_width=40", "view.patch_radius=4")
+    view = estimate(Wall(laps(1), 600), resolve_config("auto", assignments=grey)).values["view"]
+    _, width, top, bottom = view.get("crop", (0, 80, 0, 80))
+    assert view["template_height"] == 40 * (bottom - top) // width
 
 
 def test_the_threshold_lies_between_near_and_far_frames():
