@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuroslam import cli
+from neuroslam import cli, record
 from neuroslam.experiments import EXPERIMENTS
 from neuroslam.sensors import open_source
 from neuroslam.view import vision
@@ -73,13 +73,39 @@ def inputs(tmp_path_factory):
     angle = np.linspace(0.0, 20.0, 1500)
     walk = 0.5 * np.column_stack([np.cos(angle), np.sin(0.7 * angle)])
     np.savez(home / "rat.npz", t=0.05 * np.arange(1500), pos=walk, arena_radius=1.0)
+    facing = np.degrees(np.arctan2(*np.gradient(walk, axis=0).T[::-1]))
+    track = [
+        f"{50 * k},{100 * x},{100 * y},{hd}"
+        for k, ((x, y), hd) in enumerate(zip(walk, facing, strict=True))
+    ]
+    (home / "rat.csv").write_text("\n".join(["time,px,py,head", *track]))
     _datasets(home, frames)
+    _landmarks(home)
     vision.load()
     from torchvision.models import mobilenet_v2
 
     with torch.random.fork_rng():
         torch.save(mobilenet_v2().state_dict(), home / "mobilenet_v2.pth")
     return home
+
+
+def _landmarks(home):
+    """A log of motion and sightings, and a folder of two robots, of which the second drives."""
+    seen = [f"{1_700_000_000.05 + k / 20.0:.6f},7,2.0,30" for k in range(0, 100, 5)]
+    (home / "sightings.csv").write_text("\n".join(["time_s,number,distance_m,bearing_deg", *seen]))
+    files = {
+        "Barcodes.dat": "1 5\n2 14\n6 72\n",
+        "Landmark_Groundtruth.dat": "6 2.0 1.0 0 0\n",
+        "Robot2_Odometry.dat": "".join(f"{100 + k / 50:.3f} 0.5 0.0\n" for k in range(200)),
+        "Robot2_Measurement.dat": "100.55 72 2.0 0.52\n",
+        "Robot2_Groundtruth.dat": "".join(
+            f"{100 + k / 50:.3f} {k / 100} 0 0\n" for k in range(200)
+        ),
+    }
+    folder = home / "MRCLAM_Dataset1"
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text)
 
 
 def _datasets(home, frames):
@@ -148,6 +174,10 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
     if "drive.bag" in page.read_text():
         pytest.importorskip("rosbags", reason="needs the extra rosbag")
         write_bag(tmp_path / "drive.bag", list(open_source(WORLD).frames(0, 60)))
+    if "session.nwb" in page.read_text():
+        pytest.importorskip("pynwb", reason="needs the extra neuro")
+        log = record("arena:square?minutes=0.5", only=["grid"])
+        log.to_nwb(tmp_path / "session.nwb")
     merged = {map_ for line in commands(page) for map_ in line.split()[2:4] if " merge " in line}
     for line in commands(page):
         words = shlex.split(line, comments=True)[1:]

@@ -105,9 +105,9 @@ def _misfits(state: State, model: NavigationBrain) -> Iterator[str]:
 
 
 class _Expected(NamedTuple):
-    """Type and dimensions of each tensor of a state, columns of tables, of optional tables."""
+    """Type and shape without rows of each tensor of a state, columns of tables, optional tables."""
 
-    tensors: dict[str, tuple[torch.dtype, int]]
+    tensors: dict[str, tuple[torch.dtype, int, torch.Size]]
     tables: list[list[str]]
     optional: list[list[str]]
 
@@ -121,12 +121,18 @@ def _expected(model: NavigationBrain) -> _Expected:
             (found.optional if module.optional else found.tables).append(columns)
         elif isinstance(module, Scalars):
             for name, kind in module.kinds.items():
-                found.tensors[inside + name] = (torch.int64 if kind is int else torch.float64, 0)
+                found.tensors[inside + name] = _kind(
+                    torch.zeros((), dtype=torch.int64 if kind is int else torch.float64)
+                )
         for own in (module._parameters, module._buffers):
             for name, tensor in own.items():
                 if tensor is not None and name not in module._non_persistent_buffers_set:
-                    found.tensors[inside + name] = (tensor.dtype, tensor.dim())
+                    found.tensors[inside + name] = _kind(tensor)
     return found
+
+
+def _kind(tensor: torch.Tensor) -> tuple[torch.dtype, int, torch.Size]:
+    return tensor.dtype, tensor.dim(), tensor.shape[1:]
 
 
 def _fits(state: State, expected: _Expected) -> bool:
@@ -138,7 +144,7 @@ def _fits(state: State, expected: _Expected) -> bool:
         else:
             tensors = {name: kind for name, kind in tensors.items() if name not in columns}
     return (
-        {name: (tensor.dtype, tensor.dim()) for name, tensor in state.items()} == tensors
+        {name: _kind(tensor) for name, tensor in state.items()} == tensors
         and all(len({len(state[name]) for name in columns}) == 1 for columns in tables)
         and all(state[name].shape == (3,) for name in _OF_THREE if name in state)
     )

@@ -20,10 +20,12 @@ MIN_OVERLAP_BINS = 20
 CENTRE_THRESHOLD = 0.2
 """Correlation at the edge of the central peak."""
 
+MIN_SIDE_BINS = 10
+"""Bins along the shorter side of a map that has a grid score."""
+
 _REACH = 0.8  # rings end here, as a share of the map's shorter side: beyond, overlaps are small
 _MEAN_OF_RADII = 3  # a high score at a single radius may be chance
 _ANGLES_DEG = (60, 120, 30, 90, 150)
-_MIN_SIDE_BINS = 10
 _MIN_VARIANCE = 1e-10  # of the map's own; below, an overlap is flat but for rounding
 _CELLS_AT_ONCE = 16  # so many transforms fit into the processor's cache
 _MIN_APART_RAD = math.radians(30.0)  # two of the six inner peaks are never nearer in angle
@@ -184,10 +186,10 @@ def grid_stats(rate_map: np.ndarray, bin_m: float, unvisited: Unvisited = "skip"
 
 def _as_maps(who: str, maps: np.ndarray) -> np.ndarray:
     maps = np.asarray(maps, dtype=np.float64)
-    if maps.ndim < 2 or maps.size == 0 or min(maps.shape[-2:]) < _MIN_SIDE_BINS:
+    if maps.ndim < 2 or maps.size == 0 or min(maps.shape[-2:]) < MIN_SIDE_BINS:
         raise MapError(
             f"{who}: maps have shape {maps.shape}, expected (..., n_y, n_x), each side at least "
-            f"{_MIN_SIDE_BINS} bins; take smaller bins or a larger arena"
+            f"{MIN_SIDE_BINS} bins; take smaller bins or a larger arena"
         )
     if np.isinf(maps).any():
         raise MapError(f"{who}: a rate is infinite; expected finite rates, NaN where unvisited")

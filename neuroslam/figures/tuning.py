@@ -81,7 +81,7 @@ def _draw_differences(axes: Axes, tuning: Tuning) -> None:
                       color=colour, label=label)  # fmt: skip
     axes.axvline(threshold, color=INK, ls="--", lw=1.0, label=f"threshold {threshold:g}")
     axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.set(title="Differences of two templates", xlabel="mean difference (grey levels, 0 to 1)",
+    axes.set(title="Differences of two templates", xlabel="match error of two templates",
              ylabel="share of pairs (%)", xlim=(0.0, top))  # fmt: skip
     axes.legend()
 
@@ -120,7 +120,7 @@ def _turned(track_xy: np.ndarray, onto_xy: np.ndarray) -> np.ndarray:
 def _figures(trial: Any) -> str:  # noqa: ANN401 - see Tuning
     if trial.refused:
         return f"refused: {trial.refused}"
-    error = "" if np.isnan(trial.error) else f"error {100 * trial.error:.1f} % of the diagonal, "
+    error = "" if np.isnan(trial.error) else f"error {100 * trial.error:.1f} %, "
     return f"{error}{counted(trial.experiences, 'experience')}"
 
 

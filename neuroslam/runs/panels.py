@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from neuroslam.cells.boundary_sheet import unwarp, warped_tuning
 from neuroslam.cells.navigation import NavigationCells
-from neuroslam.evaluation.gridness import autocorrelogram, gridness
+from neuroslam.evaluation.gridness import MIN_SIDE_BINS, autocorrelogram, gridness
 from neuroslam.evaluation.ratemap import Bins, rate_map
 from neuroslam.figures.activity import plot_bump, plot_sheet
 from neuroslam.figures.places import plot_place_cells
@@ -115,12 +115,16 @@ class NavigationPanels(Panels):
         if len(self._positions) >= _LEAST_SAMPLES:
             at = np.array(self._positions)
             figures["cells/boundary_response"] = self._draw_boundary(at)
-            figures["cells/grid_rate_maps"], scores = self._draw_grid(cells, at)
+            field_m = min(cells.config.grid_cells.spacings_m)
+            bins = Bins.around(at, field_m / _BINS_A_FIELD)
+            if min(bins.shape) >= MIN_SIDE_BINS:  # not a straight path
+                figures["cells/grid_rate_maps"], scores = self._draw_grid(cells, at, bins)
         return figures, scores
 
-    def _draw_grid(self, cells: NavigationCells, at: np.ndarray) -> tuple[Figure, dict[str, float]]:
+    def _draw_grid(
+        self, cells: NavigationCells, at: np.ndarray, bins: Bins
+    ) -> tuple[Figure, dict[str, float]]:
         config = cells.config.grid_cells
-        bins = Bins.around(at, min(config.spacings_m) / _BINS_A_FIELD)
         rates = np.array(self._rates, dtype=np.float64)
         maps = rate_map(at, rates, bins)
         score = gridness(maps).reshape(-1, config.n_cells)

@@ -443,7 +443,7 @@ class Arena:
 
     def _cast(self, points: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """Return the distance to a wall along rays ``(n * b, 2)``, ``b`` from each point."""
-        repeat = len(ray) // len(points)
+        repeat = len(ray) // max(len(points), 1)
         s, t = self._frames(points)
         side = np.where(s < 0.0, -1.0, 1.0)
         side[:, : self._n_sides] = 1.0  # free-standing walls have two faces
