@@ -110,6 +110,8 @@ def maps(walk, rates, places, facing):
                np.append(tuned.curves[20], tuned.curves[20, 0]), color="tab:blue")  # fmt: skip
     polar.annotate("", (tuned.preferred_rad[20], tuned.length[20] * tuned.peak[20]), (0, 0),
                    arrowprops={"color": "tab:red", "width": 2, "headwidth": 8})  # fmt: skip
+    polar.set_rlabel_position(250)
+    polar.set_rticks((10, 20))
     polar.set_title(
         f"Head-direction cell (Hz): mean vector {tuned.length[20]:.2f}\n"
         f"at {np.degrees(tuned.preferred_rad[20]):.0f}°; Rayleigh z {test.z:.0f} of {spikes.sum()} "
@@ -132,7 +134,7 @@ def maps(walk, rates, places, facing):
     error = np.median(np.linalg.norm(decoded.mean_m - at, axis=1))
     axes[1, 2].set(
         title="Decoded from grid cells, held out:\n"
-        f"median error {100 * error:.0f} cm; grey: posterior at the star",
+        f"median error {100 * error:.0f} cm (grey: posterior)",
         xlabel="x (m)",
         ylabel="y (m)",
     )

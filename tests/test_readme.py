@@ -24,12 +24,22 @@ def blocks(language):
 
 def test_the_python_runs_and_closes_a_loop(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (program,) = blocks("python")
+    program = blocks("python")[0]
     exec(compile(program, "README.md", "exec"), {})
     printed = capsys.readouterr().out
     assert "loop closed at experience" in printed
     assert "path to experience 10: [" in printed
     assert (tmp_path / "brain.safetensors").exists()
+
+
+def test_rate_maps_of_all_cells_take_twelve_lines(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    program = blocks("python")[1]
+    assert len([line for line in program.splitlines() if line]) <= 12
+    assert "minutes=10&" in program
+    short = program.replace("minutes=10&", "minutes=0.5&")
+    exec(compile(short, "README.md", "exec"), {})
+    assert (tmp_path / "rate_maps.png").stat().st_size > 20_000
 
 
 @pytest.mark.parametrize(
