@@ -126,7 +126,7 @@ def test_a_config_that_asks_for_more_than_memory_is_refused(mistake, tmp_path):
     line = mistake(
         "run", WORLD, "-o", tmp_path / "o", "--set", "pose_cells.n_xy=301", "--max-memory", "10M"
     )
-    assert "pose_cells alone asks for 75 MB, the brain needs about 75 MB; expected at most" in line
+    assert "pose_cells alone asks for 75 MB, the brain needs about 76 MB; expected at most" in line
     assert not (tmp_path / "o").exists()
 
 
