@@ -30,9 +30,10 @@ from neuroslam.view.sequence import standardised
 FRAMES = 20
 """Frames of the path that is laid on the map; every second one is compared."""
 
-LARGEST_ERROR, LARGEST_RATIO = 1.4, 0.7
-"""Evidence for a belief: mean match error along the path in units of ``view.threshold``, and
-runner-up score over best score. Fixed on other drives than those that are reported."""
+LARGEST_ERROR, LARGEST_RATIO = 0.75, 0.75
+"""Evidence for a belief: mean match error along the path as a share of that with all experiences,
+whatever the views are made of, and runner-up score over best score. Fixed on other drives than
+those that are reported."""
 
 AGREE = 3
 """Frames in a row whose evidence must agree before the robot is found, or found elsewhere."""
@@ -78,10 +79,11 @@ class _Seen(NamedTuple):
 
 
 class _Laid(NamedTuple):
-    """Scores and mean match errors of the path laid at some experiences."""
+    """Scores and mean match errors of the path laid at some experiences; errors also as shares."""
 
     scores: np.ndarray
     errors: np.ndarray
+    shares: np.ndarray
 
 
 class Localiser:
@@ -150,14 +152,14 @@ class Localiser:
         self._move(frame)
         estimate = self._estimate(frame)
         if estimate is None:
-            error, ratio, laid = np.nan, 1.0, None
+            error, share, ratio, laid = np.nan, 1.0, 1.0, None
         else:
-            experience, turn_rad, error, ratio = estimate
+            experience, turn_rad, error, share, ratio = estimate
             x_m, y_m, theta_rad = self.poses[experience].tolist()
             laid = Pose(x_m, y_m, theta_rad + turn_rad)
         good = (
             laid is not None
-            and error <= LARGEST_ERROR * self.config.view.threshold
+            and share <= LARGEST_ERROR
             and ratio <= LARGEST_RATIO
             and len(self._path) >= LEAST_FRAMES
             and self._path[-1].path_m - self._path[0].path_m >= LEAST_PATH * self.place_m
@@ -199,8 +201,8 @@ class Localiser:
             pose, experience, confidence, since_m = self._belief
             self._belief = compose(pose, step), experience, confidence, since_m
 
-    def _estimate(self, frame: Frame) -> tuple[int, float, float, float] | None:
-        """Lay the path; return experience, relative heading, mean match error and ratio."""
+    def _estimate(self, frame: Frame) -> tuple[int, float, float, float, float] | None:
+        """Lay the path; return experience, relative heading, match error, its share, and ratio."""
         view = None if frame.image is None else self.brain.view.usable_view(frame.image)
         if view is None:
             return None
@@ -218,8 +220,8 @@ class Localiser:
         if laid.scores[best] < 0.0:
             others = self._lay(elsewhere, turns_rad).scores if len(elsewhere) else np.zeros(1)
             ratio = float(np.clip(others.min() / laid.scores[best], 0.0, 1.0))
-        turn_rad = float(turns_rad[near[best]])
-        return int(self._own[near[best]]), turn_rad, float(laid.errors[best]), ratio
+        error, share = float(laid.errors[best]), float(laid.shares[best])
+        return int(self._own[near[best]]), float(turns_rad[near[best]]), error, share, ratio
 
     @staticmethod
     def _resembling(z: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -251,10 +253,8 @@ class Localiser:
         least = np.where(on_map, errors[rows, which], np.inf).min(axis=2)
         usual = errors.mean(axis=1)
         off = np.isinf(scores)
-        return _Laid(
-            np.where(off, 0.0, scores).mean(axis=1),
-            np.where(off, usual[None], least).mean(axis=1),
-        )
+        error = np.where(off, usual[None], least).mean(axis=1)
+        return _Laid(np.where(off, 0.0, scores).mean(axis=1), error, error / usual.mean())
 
     def _agrees(self, laid: Pose) -> bool:
         """Return whether this evidence agrees with the belief, or with that of enough frames."""
