@@ -10,7 +10,5 @@ for axes, name in zip(rows, log.names, strict=True):
     cells = log[name].var(axis=0).argsort()[::-1][:6]  # that vary most
     maps = rate_map(log.position_m, log[name][:, cells], bins)
     for ax, k, one in zip(axes, cells, maps, strict=True):
-        ax.imshow(one, origin="lower", extent=bins.extent_m).axes.set_title(
-            f"{name} {k} (x, y in m)"
-        )
+        ax.imshow(one, origin="lower", extent=bins.extent_m).axes.set_title(f"{name} {k} (m)")
 figure.savefig("rate_maps.png")
