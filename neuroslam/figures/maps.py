@@ -82,7 +82,7 @@ def plot_map(
         figure = new_figure(11.0 if odometry_xy is not None else 6.2, tall, title)
         axes = figure.subplots(1, 2 if odometry_xy is not None else 1, squeeze=False)[0]
         if odometry_xy is not None:
-            draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of)
+            draw_odometry(axes[0], np.asarray(odometry_xy), odometry_of, unit)
         draw_map(
             axes[-1], poses, links, track_xy, truth_xy, walls, current, landmarks, session,
             session_names, planned,

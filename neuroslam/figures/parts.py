@@ -74,11 +74,15 @@ def _align_truth(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray 
     return _Truth(alignment.undo(truth), walls_on_map, f"truth: ATE {_metres(ate)}, {how}")
 
 
-def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "") -> None:
-    """Draw a dead-reckoned track ``(k, 2)``; the legend names its session, if given."""
+def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "", unit: str = "m") -> None:
+    """Draw a dead-reckoned track ``(k, 2)``; the legend names its session, if given.
+
+    Its length is written where the unit is metres: an arbitrary one has no length to state.
+    """
     axes.plot(*xy.T, color=ODOMETRY, lw=1.1, label=f"odometry of {whose}" if whose else "odometry")
     _draw_ends(axes, xy)
-    write_title(axes, "Odometry alone", f"{counted(len(xy), 'frame')} · {path_length(xy):,.1f} m")
+    length = f" · {path_length(xy):,.1f} m" if unit == "m" else ""
+    write_title(axes, "Odometry alone", counted(len(xy), "frame") + length)
     _metric(axes)
 
 

@@ -334,3 +334,13 @@ def test_a_summary_leaves_out_what_the_brain_does_not_have():
     names = [axes.get_title("left") for axes in figure.get_axes()]
     assert names == ["Experience map", "View matches", "Size of the map"]
     assert style.render(figure).shape == (1000, 1400, 3)
+
+
+def test_a_length_is_stated_in_metres_only():
+    odometry, poses = maze_run()
+    for unit, states in (("m", True), ("arbitrary unit", False)):
+        figure = maps.plot_map(poses, RING[:0], odometry_xy=odometry, unit=unit)
+        written = [text.get_text() for text in figure.axes[0].findobj(mpl.text.Text)]
+        assert (
+            any(text.startswith("60 frames") and text.endswith(" m") for text in written) == states
+        )
