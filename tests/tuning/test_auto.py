@@ -1,13 +1,14 @@
 """Estimates from the first laps: threshold and band by the views, field of view by the laps."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from neuroslam.runs.run import resolve_config
 from neuroslam.sensors import open_source
-from neuroslam.tuning.auto import estimate, has_pictures
+from neuroslam.tuning.auto import SHARE, estimate, has_pictures
 from neuroslam.types import Frame
 from tests.brain.test_tracker import laps, strip
 
@@ -51,6 +52,11 @@ def test_the_band_with_the_wall_is_found():
     found = estimate(Wall(laps(2), 600), resolve_config("auto"))
     assert found.values["view"]["crop"] == (0, 80, 0, 40)
     assert found.values["view"]["template_height"] == 120  # 20 rows of 6 orientations
+
+
+def test_the_page_states_the_share_that_is_the_threshold():
+    page = (Path(__file__).parents[2] / "docs" / "tuning.md").read_text()
+    assert f"{SHARE:g} of the mean match error between far frames" in page
 
 
 def test_pixels_of_grey_views_are_square():
