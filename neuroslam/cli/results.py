@@ -115,13 +115,16 @@ def export_command(
     path: MapFile,
     to: Annotated[Path, typer.Argument(metavar="TO", help="File to write.")],
     kind: Annotated[
-        str | None, typer.Option(help="tum, g2o, graphml or nir; default: the suffix of TO.")
+        str | None, typer.Option(help="tum, g2o, graphml, nir or mcap; default: the suffix of TO.")
+    ] = None,
+    source: Annotated[
+        str | None, typer.Option(help="Source of the pictures of mcap; default: the run's.")
     ] = None,
 ) -> int:
-    """Export a map as TUM, g2o, GraphML or NIR."""
+    """Export a map as TUM, g2o, GraphML, NIR or MCAP."""
     from neuroslam.runs.export import export
 
-    say(f"Written: {export(path, to, kind)}")
+    say(f"Written: {export(path, to, kind, source, lambda note: say(f'Left out: {note}'))}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Export of a map: trajectories, pose graphs, graph files and neuromorphic networks."""
+"""Export of a map: trajectories, pose graphs, graph files, MCAP and neuromorphic networks."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file
+from neuroslam.runs.mcap import export_mcap
 from neuroslam.runs.reading import track_file
 from neuroslam.spiking.export import export_nir
 from neuroslam.spiking.path_integrator import PathIntegrator
@@ -19,7 +20,13 @@ from neuroslam.state.files import write_atomically
 from neuroslam.state.sessions import session_name
 
 
-def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
+def export(
+    path: str | Path,
+    to: str | Path,
+    kind: str | None = None,
+    source: str | Path | None = None,
+    on_note: Callable[[str], object] = lambda _note: None,
+) -> Path:
     r"""Write a map in the format of another program.
 
     - ``tum``: for a run folder its ``trajectory.tum``, one pose per frame; for a brain file the
@@ -34,30 +41,37 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
       edge for each link with its measurements.
     - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
       (:func:`neuroslam.spiking.export.export_nir`, extra ``spiking-export``).
+    - ``mcap``: a run folder with Foxglove's schemas: pictures, poses, path, graph and activity of
+      cells (:func:`neuroslam.runs.mcap.export_mcap`, extra ``mcap``).
 
     Args:
         path: Brain file, or folder of a run.
         to: File to write, whole or not at all; an existing file is replaced.
-        kind: ``tum``, ``g2o``, ``graphml`` or ``nir``; default: the suffix of ``to``.
+        kind: ``tum``, ``g2o``, ``graphml``, ``nir`` or ``mcap``; default: the suffix of ``to``.
+        source: Source of the pictures of ``mcap``; default: that of the run.
+        on_note: Called with each line about what is left out.
 
     Returns:
         ``to``.
 
     Raises:
         CheckpointError: If the brain cannot be read.
-        SourceError: If a run's trajectory cannot be read.
+        SourceError: If a run's trajectory or the given source cannot be read.
         RunError: If the kind is unknown, the map is empty or ``to`` cannot be written.
-        ConfigError: If ``nir`` is requested but not installed, or the brain has no spiking neurons.
+        ConfigError: If the extra of the kind is not installed, or ``nir`` is requested and the
+            brain has no spiking neurons.
     """
     path, to = Path(path), Path(to)
     asked = kind or to.suffix.removeprefix(".").lower()
-    if asked not in _WRITERS:
+    if asked != "mcap" and asked not in _WRITERS:
         raise RunError(
-            f"{to}: unknown export format {asked!r}; expected tum, g2o, graphml or nir as suffix "
-            "or --kind"
+            f"{to}: unknown export format {asked!r}; expected tum, g2o, graphml, nir or mcap as "
+            "suffix or --kind"
         )
-    source = brain_file(path)
-    if to.resolve() == source.resolve():
+    if source is not None and asked != "mcap":
+        raise RunError(f"--source {source}: is of use for mcap only, not for {asked}")
+    stored = brain_file(path)
+    if to.resolve() == stored.resolve():
         raise RunError(f"{to}: is the brain file to export; choose another output file")
     if asked == "tum" and path.is_dir():
         track = track_file(path)
@@ -66,8 +80,13 @@ def export(path: str | Path, to: str | Path, kind: str | None = None) -> Path:
         def write() -> None:
             text = track.read_bytes()
             write_atomically(to, lambda file: file.write_bytes(text))
+    elif asked == "mcap":
+
+        def write() -> None:
+            for note in export_mcap(path, to, source):
+                on_note(note)
     else:
-        brain = load_brain(source)
+        brain = load_brain(stored)
         if not brain.map.n and asked != "nir":
             raise RunError(f"{path}: its map is empty; nothing to export")
         write = partial(_WRITERS[asked], brain, to)

@@ -1,30 +1,49 @@
-"""A run as an MCAP file with Foxglove's schemas, for Foxglove and other viewers; extra ``mcap``.
+"""A run as an MCAP file with Foxglove's schemas, for Foxglove, ROS 2 and others; extra ``mcap``.
 
-===========  ============================  =====================================================
-``/camera``  ``foxglove.CompressedImage``  the picture of a frame, JPEG
-``/pose``    ``foxglove.PoseInFrame``      pose on the map at that time
-``/cells``   ``foxglove.CompressedImage``  activity of the cells that lead, PNG, every tenth frame
-``/status``  ``neuroslam.Status``          action, template, experience, match error
-``/graph``   ``foxglove.SceneUpdate``      experiences and links, at growing intervals and the end
-``/path``    ``foxglove.PosesInFrame``     path on the finished map, at the end
-===========  ============================  =====================================================
+===========  =================================  ================================================
+``/camera``  ``foxglove_msgs/CompressedImage``  the picture of a frame, JPEG
+``/pose``    ``foxglove_msgs/PoseInFrame``      pose on the map
+``/cells``   ``foxglove_msgs/CompressedImage``  activity of the cells that lead, PNG
+``/status``  ``neuroslam_msgs/Status``          action, template, experience, match error
+``/graph``   ``foxglove_msgs/SceneUpdate``      experiences and links
+``/path``    ``foxglove_msgs/PosesInFrame``     path on the finished map
+===========  =================================  ================================================
 
-Messages are JSON; the frame is ``map``. Times are those of the source.
+Messages are CDR under the profile ``ros2``; the frame is ``map``. Times are those of the source.
+While a run goes on, poses are those that were estimated then, ``/cells`` follows every tenth frame,
+``/graph`` at growing intervals and at the end, ``/path`` at the end. Of a finished run, poses,
+graph and path are those of the finished map, the latter two at its first time, and a frame is lost
+if it has no place on that map.
 """
 
-import base64
-import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-import cv2
 import numpy as np
 
-from neuroslam.errors import ConfigError, RunError
+from neuroslam.brain import load_brain
+from neuroslam.errors import ConfigError, RunError, SourceError
 from neuroslam.geometry import compose_poses
+from neuroslam.runs.files import brain_file
+from neuroslam.runs.foxglove import (
+    FRAME_ID,
+    activity_of,
+    definition,
+    graph_of,
+    path_of,
+    picture_of,
+    pose_of,
+    stamp_of,
+    to_cdr,
+)
+from neuroslam.runs.reading import read_actions, read_frames, read_plan, read_trace, trajectory
 from neuroslam.runs.recording import Recorder
+from neuroslam.sensors import open_source
+from neuroslam.state.activity import ACTIVITY, ActivityLog
 from neuroslam.state.answers import pictures_of
+from neuroslam.state.files import write_atomically
 from neuroslam.types import NO_EXPERIENCE, Frame, Pose, StepResult
 
 if TYPE_CHECKING:
@@ -33,86 +52,19 @@ if TYPE_CHECKING:
 CELLS_EVERY, FIRST_GRAPH = 10, 50
 """Frames between two pictures of the cells, and until the first graph; the intervals double."""
 
-_JPEG_QUALITY = 80
-_FRAME = "map"
-_TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
-_XYZ = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
-_XYZW = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyzw"}}
-_POSE = {"type": "object", "properties": {"position": _XYZ, "orientation": _XYZW}}
-_RGBA = {"type": "object", "properties": {letter: {"type": "number"} for letter in "rgba"}}
-_TEXT, _NUMBER, _FLAG = {"type": "string"}, {"type": "number"}, {"type": "boolean"}
-_LIST: dict[str, Any] = {"type": "array"}
-_LINES = {
-    "type": "object",
-    "properties": {
-        "type": {"type": "integer"},
-        "pose": _POSE,
-        "thickness": _NUMBER,
-        "scale_invariant": _FLAG,
-        "points": _LIST | {"items": _XYZ},
-        "color": _RGBA,
-        "colors": _LIST | {"items": _RGBA},
-        "indices": _LIST | {"items": {"type": "integer"}},
-    },
-}
-_SPHERE = {"type": "object", "properties": {"pose": _POSE, "size": _XYZ, "color": _RGBA}}
-_ENTITY = {
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "frame_id": _TEXT,
-        "id": _TEXT,
-        "lifetime": _TIME,
-        "frame_locked": _FLAG,
-        "metadata": _LIST | {"items": {"type": "object"}},
-        "arrows": _LIST | {"items": {"type": "object"}},
-        "cubes": _LIST | {"items": {"type": "object"}},
-        "spheres": _LIST | {"items": _SPHERE},
-        "cylinders": _LIST | {"items": {"type": "object"}},
-        "lines": _LIST | {"items": _LINES},
-        "triangles": _LIST | {"items": {"type": "object"}},
-        "texts": _LIST | {"items": {"type": "object"}},
-        "models": _LIST | {"items": {"type": "object"}},
-    },
-}
-_IMAGE = {"data": {"type": "string", "contentEncoding": "base64"}, "format": _TEXT}
-SCHEMAS: dict[str, dict[str, Any]] = {
-    "foxglove.CompressedImage": {"timestamp": _TIME, "frame_id": _TEXT, **_IMAGE},
-    "foxglove.PoseInFrame": {"timestamp": _TIME, "frame_id": _TEXT, "pose": _POSE},
-    "foxglove.PosesInFrame": {
-        "timestamp": _TIME,
-        "frame_id": _TEXT,
-        "poses": _LIST | {"items": _POSE},
-    },
-    "foxglove.SceneUpdate": {
-        "deletions": _LIST | {"items": {"type": "object"}},
-        "entities": _LIST | {"items": _ENTITY},
-    },
-    "neuroslam.Status": {
-        "timestamp": _TIME,
-        "frame": {"type": "integer"},
-        "action": _TEXT,
-        "template": {"type": "integer"},
-        "experience": {"type": "integer"},
-        "match_error": _NUMBER,
-        "lost": _FLAG,
-    },
-}
-"""JSON schema of each message type, its properties."""
-
 TOPICS = {
-    "/camera": "foxglove.CompressedImage",
-    "/pose": "foxglove.PoseInFrame",
-    "/cells": "foxglove.CompressedImage",
-    "/status": "neuroslam.Status",
-    "/graph": "foxglove.SceneUpdate",
-    "/path": "foxglove.PosesInFrame",
+    "/camera": "foxglove_msgs/CompressedImage",
+    "/pose": "foxglove_msgs/PoseInFrame",
+    "/cells": "foxglove_msgs/CompressedImage",
+    "/status": "neuroslam_msgs/Status",
+    "/graph": "foxglove_msgs/SceneUpdate",
+    "/path": "foxglove_msgs/PosesInFrame",
 }
 """Message type of each channel."""
 
 
-class McapRecorder(Recorder):
-    """Writes a run into an MCAP file while it goes on.
+class McapFile:
+    """An MCAP file that is written message by message.
 
     Args:
         path: The file; an existing one is replaced.
@@ -135,16 +87,52 @@ class McapRecorder(Recorder):
         except OSError as error:
             raise RunError(f"{path}: cannot be written ({error.strerror or error})") from None
         self._writer = Writer(self._file)
-        self._writer.start(profile="", library="neuroslam")
+        self._writer.start(profile="ros2", library="neuroslam")
         self._channels: dict[str, int] = {}
         schemas: dict[str, int] = {}
-        for topic, name in TOPICS.items():
-            if name not in schemas:
-                whole = {"title": name, "type": "object", "properties": SCHEMAS[name]}
-                schemas[name] = self._writer.register_schema(
-                    name, "jsonschema", json.dumps(whole).encode()
-                )
-            self._channels[topic] = self._writer.register_channel(topic, "json", schemas[name])
+        for topic, kind in TOPICS.items():
+            if kind not in schemas:
+                name = kind.replace("/", "/msg/")
+                text = definition(kind).encode()
+                schemas[kind] = self._writer.register_schema(name, "ros2msg", text)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schemas[kind])
+
+    def write(self, topic: str, time_s: float, message: dict[str, Any]) -> None:
+        """Append a message of one of :data:`TOPICS`."""
+        at_ns = max(round(time_s * 1e9), 0)
+        data = to_cdr(TOPICS[topic], message)
+        self._writer.add_message(self._channels[topic], at_ns, data, at_ns)
+
+    def write_pose(self, time_s: float, pose: Pose) -> None:
+        """Append a pose on the map."""
+        message = {"timestamp": stamp_of(time_s), "frame_id": FRAME_ID, "pose": pose_of(pose)}
+        self.write("/pose", time_s, message)
+
+    def close(self) -> None:
+        """Write the index of the file."""
+        self._writer.finish()
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+
+class McapRecorder(Recorder):
+    """Writes a run into an MCAP file while it goes on.
+
+    Args:
+        path: The file; an existing one is replaced.
+
+    Raises:
+        ConfigError: If the extra is not installed.
+        RunError: If the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = McapFile(path)
         self._seen, self._graph_due = 0, FIRST_GRAPH
         self._steps: list[tuple[int, Pose]] = []
         self._last: tuple[float, NavigationBrain] | None = None
@@ -155,10 +143,8 @@ class McapRecorder(Recorder):
         time_s = float(frame.time_s)
         stamp = stamp_of(time_s)
         if frame.image is not None:
-            self._write("/camera", time_s, picture_of(frame.image, stamp, "camera"))
-        self._write(
-            "/pose", time_s, {"timestamp": stamp, "frame_id": _FRAME, "pose": pose_of(result.pose)}
-        )
+            self._file.write("/camera", time_s, picture_of(frame.image, stamp, "camera"))
+        self._file.write_pose(time_s, result.pose)
         status = {
             "timestamp": stamp,
             "frame": result.frame,
@@ -168,36 +154,17 @@ class McapRecorder(Recorder):
             "match_error": float(result.view.error),
             "lost": bool(result.lost),
         }
-        self._write("/status", time_s, status)
-        if self._seen % CELLS_EVERY == 0:
-            self._write_cells(time_s, brain)
+        self._file.write("/status", time_s, status)
+        if self._seen % CELLS_EVERY == 0 and (layer := _picture(brain)) is not None:
+            self._file.write("/cells", time_s, activity_of(layer, stamp))
         self._seen += 1
         if result.experience != NO_EXPERIENCE:
             self._steps.append((result.experience, brain.map.offset))
         self._last = time_s, brain
         if self._seen >= self._graph_due:
             self._graph_due *= 2
-            self._write("/graph", time_s, graph_of(brain, stamp))
-
-    def _write_cells(self, time_s: float, brain: "NavigationBrain") -> None:
-        for picture in pictures_of(brain.leader).values():
-            layer = np.asarray(picture[0] if isinstance(picture, tuple) else picture)
-            if layer.ndim == 2:
-                largest = float(np.nanmax(layer)) or 1.0
-                layer = np.clip(255.0 * np.nan_to_num(layer) / largest, 0.0, 255.0)
-            image = {
-                "timestamp": stamp_of(time_s),
-                "frame_id": "cells",
-                "format": "png",
-                "data": encoded(".png", layer.astype(np.uint8)),
-            }
-            self._write("/cells", time_s, image)
-            return
-
-    def _write(self, topic: str, time_s: float, message: dict[str, Any]) -> None:
-        at_ns = max(round(time_s * 1e9), 0)
-        data = json.dumps(message).encode()
-        self._writer.add_message(self._channels[topic], at_ns, data, at_ns)
+            graph = graph_of(brain.map.poses, brain.map.links, stamp)
+            self._file.write("/graph", time_s, graph)
 
     def close(self) -> None:
         """Write the finished graph and path, and the index of the file."""
@@ -206,91 +173,130 @@ class McapRecorder(Recorder):
         self._closed = True
         if self._last is not None:
             time_s, brain = self._last
-            stamp = stamp_of(time_s)
-            self._write("/graph", time_s, graph_of(brain, stamp))
-            poses = brain.map.poses
+            stamp, poses = stamp_of(time_s), brain.map.poses
+            self._file.write("/graph", time_s, graph_of(poses, brain.map.links, stamp))
             known = [(e, offset) for e, offset in self._steps if e < len(poses)]
             path = np.empty((0, 3))
             if known:
                 ids, offsets = zip(*known, strict=True)
                 path = compose_poses(poses[list(ids)], np.array(offsets))
-            track = [pose_of(Pose(*row)) for row in path.tolist()]
-            self._write("/path", time_s, {"timestamp": stamp, "frame_id": _FRAME, "poses": track})
-        self._writer.finish()
+            self._file.write("/path", time_s, path_of(path.tolist(), stamp))
         self._file.close()
 
 
-def stamp_of(time_s: float) -> dict[str, int]:
-    """Return a time as Foxglove writes it.
+def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = None) -> list[str]:
+    """Write a finished run as an MCAP file, whole or not at all.
 
-    Example:
-        >>> stamp_of(1.25)
-        {'sec': 1, 'nsec': 250000000}
+    ``/cells`` has the samples of ``--record cells``, or, without them, the last state alone.
+
+    Args:
+        run: Folder of the run.
+        to: File to write; an existing one is replaced.
+        source: Source of the pictures; default: that of the run.
+
+    Returns:
+        What is left out, and why, a line each: the pictures, if a default source is no longer
+        there or has none.
+
+    Raises:
+        RunError, CheckpointError: If the run cannot be read.
+        SourceError: If ``source`` is given and cannot be opened.
+        ConfigError: If the extra is not installed.
     """
-    whole = math.floor(time_s)
-    return {"sec": whole, "nsec": min(round((time_s - whole) * 1e9), 999_999_999)}
+    run, to = Path(run), Path(to)
+    if not run.is_dir():
+        raise RunError(f"{run}: is not the folder of a run, which mcap needs")
+    brain = load_brain(brain_file(run))
+    rows = brain.clock.frames_seen
+    frames, actions, trace = read_frames(run, rows), read_actions(run, rows), read_trace(run, rows)
+    poses = trajectory(brain, trace)
+    known = np.isfinite(poses).all(axis=1)
+    times_s = frames["time_s"]
+    notes: list[str] = []
+
+    def write(path: Path) -> None:
+        with McapFile(path) as file:
+            begin = stamp_of(float(times_s[0]))
+            graph = graph_of(brain.map.poses, brain.map.links, begin)
+            file.write("/graph", float(times_s[0]), graph)
+            file.write("/path", float(times_s[0]), path_of(poses[known].tolist(), begin))
+            pictures = _pictures(run, brain, source, notes)
+            cells = _cells(run, brain, float(times_s[-1]))
+            picture, sample = next(pictures, None), next(cells, None)
+            for i, number in enumerate(frames["frame"].astype(int).tolist()):
+                time_s = float(times_s[i])
+                stamp = stamp_of(time_s)
+                while picture is not None and picture[0] < number:
+                    picture = next(pictures, None)
+                if picture is not None and picture[0] == number:
+                    file.write("/camera", time_s, picture_of(picture[1], stamp, "camera"))
+                if known[i]:
+                    file.write_pose(time_s, Pose(*poses[i].tolist()))
+                status = {
+                    "timestamp": stamp,
+                    "frame": number,
+                    "action": str(actions[i]),
+                    "template": int(frames["template"][i]),
+                    "experience": int(frames["experience"][i]),
+                    "match_error": float(frames["match_error"][i]),
+                    "lost": not known[i],
+                }
+                file.write("/status", time_s, status)
+                while sample is not None and sample[0] <= time_s:
+                    file.write("/cells", time_s, activity_of(sample[1], stamp))
+                    sample = next(cells, None)
+
+    write_atomically(to, write)
+    return notes
 
 
-def pose_of(pose: Pose) -> dict[str, Any]:
-    """Return a pose of the plane as position and quaternion.
+def _pictures(
+    run: Path, brain: "NavigationBrain", source: str | Path | None, notes: list[str]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield number and picture of every frame that has one, and note if there are none."""
+    plan = read_plan(run)
+    name, n = plan.source if source is None else source, 0
+    try:
+        opened = open_source(name, brain.config.frame_rate_hz, brain.config.view.grey)
+        for frame in opened.frames(plan.start, brain.clock.frame + 1, lambda _: None):
+            if frame.image is not None:
+                n += 1
+                yield frame.index, frame.image
+    except SourceError as error:
+        if source is not None:
+            raise
+        notes.append(f"{n or 'no'} pictures: {error}; give the source with --source")
+        return
+    if not n:
+        notes.append(f"no pictures: {name} has none")
 
-    Example:
-        >>> pose_of(Pose(1.0, 2.0, 0.0))["orientation"]
-        {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+
+def _cells(run: Path, brain: "NavigationBrain", end_s: float) -> Iterator[tuple[float, np.ndarray]]:
+    """Yield time and picture of the recorded activity of the cells that lead."""
+    now = _picture(brain)
+    name, rates = next(iter(brain.leader.recorded().items()), ("", np.zeros(0)))
+    if (run / ACTIVITY).is_dir() and name in (log := ActivityLog.open(run / ACTIVITY)).names:
+        for time_s, row in zip(log.time_s.tolist(), log[name], strict=True):
+            yield time_s, _folded(row, None if now is None else now.shape, len(rates))
+    elif now is not None:
+        yield end_s, now
+
+
+def _folded(row: np.ndarray, shape: tuple[int, ...] | None, n: int) -> np.ndarray:
+    """Return the activity of cells as a picture.
+
+    Cells that fill layers of the shape of the population's own picture are summed over the layers;
+    others are laid in rows of a square.
     """
-    half = 0.5 * pose.theta_rad
-    return {
-        "position": {"x": float(pose.x_m), "y": float(pose.y_m), "z": 0.0},
-        "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
-    }
+    if shape is not None and len(shape) == 2 and n and n % math.prod(shape) == 0:
+        layers: np.ndarray = row[:n].reshape(-1, *shape).sum(axis=0)
+        return layers
+    side = math.ceil(math.sqrt(max(len(row), 1)))
+    return np.pad(row, (0, side * math.ceil(len(row) / side) - len(row))).reshape(-1, side)
 
 
-def picture_of(image: np.ndarray, stamp: dict[str, int], frame_id: str) -> dict[str, Any]:
-    """Return a picture, RGB or grey, as a JPEG message."""
-    bgr = image if image.ndim == 2 else image[:, :, ::-1]
-    data = encoded(".jpg", np.ascontiguousarray(bgr), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return {"timestamp": stamp, "frame_id": frame_id, "format": "jpeg", "data": data}
-
-
-def encoded(suffix: str, image: np.ndarray, options: list[int] | None = None) -> str:
-    """Encode a picture, and that as base64."""
-    return base64.b64encode(cv2.imencode(suffix, image, options or [])[1].tobytes()).decode()
-
-
-def graph_of(brain: "NavigationBrain", stamp: dict[str, int]) -> dict[str, Any]:
-    """Return experiences and links as a scene: a list of lines, and a sphere each experience."""
-    poses, links = brain.map.poses, brain.map.links
-    ends = np.column_stack([links.source, links.target]).reshape(-1)
-    points = [{"x": x, "y": y, "z": 0.0} for x, y in poses[ends, :2].tolist()]
-    length = float(np.median(links.distance_m)) if len(links.distance_m) else 1.0
-    size = 0.3 * max(length, 1e-3)
-    lines = {
-        "type": 2,  # pairs of points
-        "pose": pose_of(Pose(0.0, 0.0, 0.0)),
-        "thickness": 1.5,
-        "scale_invariant": True,
-        "points": points,
-        "color": {"r": 0.12, "g": 0.47, "b": 0.71, "a": 1.0},
-        "colors": [],
-        "indices": [],
-    }
-    spheres = [
-        {
-            "pose": pose_of(Pose(*row)),
-            "size": {"x": size, "y": size, "z": size},
-            "color": {"r": 0.9, "g": 0.45, "b": 0.1, "a": 1.0},
-        }
-        for row in poses.tolist()
-    ]
-    empty = ("metadata", "arrows", "cubes", "cylinders", "triangles", "texts", "models")
-    entity: dict[str, Any] = {
-        "timestamp": stamp,
-        "frame_id": _FRAME,
-        "id": "graph",
-        "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": False,
-        **{name: [] for name in empty},
-        "lines": [lines],
-        "spheres": spheres,
-    }
-    return {"deletions": [], "entities": [entity]}
+def _picture(brain: "NavigationBrain") -> np.ndarray | None:
+    """Return the first picture of the cells that lead, if they draw any."""
+    for picture in pictures_of(brain.leader).values():
+        return np.asarray(picture[0] if isinstance(picture, tuple) else picture)
+    return None

@@ -192,10 +192,10 @@ def test_a_map_of_one_place_has_no_edges(tmp_path):
         (
             "map.svg",
             None,
-            "map.svg: unknown export format 'svg'; expected tum, g2o, graphml or nir",
+            "map.svg: unknown export format 'svg'; expected tum, g2o, graphml, nir or mcap",
         ),
-        ("map", None, "map: unknown export format ''; expected tum, g2o, graphml or nir"),
-        ("map.g2o", "dot", "unknown export format 'dot'; expected tum, g2o, graphml or nir"),
+        ("map", None, "map: unknown export format ''; expected tum, g2o, graphml, nir or mcap"),
+        ("map.g2o", "dot", "unknown export format 'dot'; expected tum, g2o, graphml, nir or mcap"),
         (
             "brain.safetensors",
             "g2o",
