@@ -611,6 +611,13 @@ def test_typing_errors_are_explained(arguments, cause, tmp_path, monkeypatch, ca
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_package_can_be_run_as_a_module():
+    command = [sys.executable, "-m", "neuroslam", "inspect", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("neuroslam inspect: nowhere: no such brain file")
+
+
 def test_help_comes_at_once_without_torch():
     program = (
         "import sys; from neuroslam.cli import main; code = main(['--help']);"
