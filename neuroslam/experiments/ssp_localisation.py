@@ -45,6 +45,10 @@ CONFIGS: dict[str, SSPSLAMConfig] = {
     "spiking, velocity in neurons": SSPSLAMConfig(
         integrator=PathIntegratorConfig(neurons=640, velocity_neurons=500)
     ),
+    "quantised": SSPSLAMConfig(quantised=True, integrator=PathIntegratorConfig(neurons=640)),
+    "quantised, velocity in neurons": SSPSLAMConfig(
+        quantised=True, integrator=PathIntegratorConfig(neurons=640, velocity_neurons=500)
+    ),
     "spiking, exact binding": SSPSLAMConfig(
         binding="exact", integrator=PathIntegratorConfig(neurons=1000)
     ),

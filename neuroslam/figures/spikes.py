@@ -53,6 +53,7 @@ class Run(NamedTuple):
         position_m: ``(t, dimension)``.
         error_m: Distance to the truth, ``(t,)``.
         probability: Density at the true position over the peak density, ``(t,)``.
+        paired: Whether it is a variant of the run before it: drawn dashed, in the same colour.
     """
 
     label: str
@@ -60,6 +61,7 @@ class Run(NamedTuple):
     position_m: np.ndarray
     error_m: np.ndarray
     probability: np.ndarray | None = None
+    paired: bool = False
 
 
 def draw_spikes(axes: Axes, cell: Spikes) -> None:
@@ -253,24 +255,29 @@ def plot_dead_reckoning(truth: Run, runs: Sequence[Run], title: str) -> Figure:
         title: Title of the whole figure.
     """
     dimension = truth.position_m.shape[1]
+    order = np.cumsum([not run.paired for run in runs]) - 1
+    looks = [
+        {"color": CURVES[k % len(CURVES)], "ls": "--" if run.paired else "-"}
+        for k, run in zip(order, runs, strict=True)
+    ]
     with mpl.rc_context(STYLE):
         figure = new_figure(10.5, 1.75 * dimension + 1.4, title)
         left, right = figure.subfigures(1, 2, wspace=0.03, squeeze=False)[0]
         axes = left.subplots(dimension, 1, sharex=True, squeeze=False).ravel()
         for k, ax in enumerate(axes):
             ax.plot(truth.time_s, truth.position_m[:, k], color="#bcbcbc", lw=3.0, label="truth")
-            for run, colour in zip(runs, CURVES, strict=False):
-                ax.plot(run.time_s, run.position_m[:, k], color=colour, lw=0.9, label=run.label)
+            for run, look in zip(runs, looks, strict=True):
+                ax.plot(run.time_s, run.position_m[:, k], lw=0.9, label=run.label, **look)
             ax.set_ylabel(f"{'xyzuvw'[k]} (m)")
         axes[-1].set_xlabel("time (s)")
         write_title(axes[0], "Position, true and estimated")
         probability, error = right.subplots(2, 1, sharex=True)
-        for run, colour in zip(runs, CURVES, strict=False):
+        for run, look in zip(runs, looks, strict=True):
             if run.probability is not None:
-                probability.plot(run.time_s, run.probability, color=colour, lw=0.9)
+                probability.plot(run.time_s, run.probability, lw=0.9, **look)
             rmse = np.sqrt(np.cumsum(run.error_m**2) / np.arange(1, len(run.error_m) + 1))
-            error.plot(run.time_s, run.error_m, color=colour, lw=0.6, alpha=0.5)
-            error.plot(run.time_s, rmse, color=colour, lw=1.6)
+            error.plot(run.time_s, run.error_m, lw=0.6, alpha=0.5, **look)
+            error.plot(run.time_s, rmse, lw=1.6, **look)
         probability.set(ylabel="density / peak density", ylim=(0, 1.05))
         error.set(xlabel="time (s)", ylabel="error (m)", ylim=(0, None))
         write_title(probability, "Probability density at the true position")

@@ -55,16 +55,22 @@ def test_three_dimensions_are_like_two(tmp_path):
 
 
 def test_kitti_is_dead_reckoned_in_floating_point_and_quantised(shared, tmp_path):
-    found = ssp_kitti(shared / "data" / "kitti_00", tmp_path, seconds=3.0, budgets=(3600,))
-    assert [row["integrator"] for row in found["rows"]] == [
-        "plain, 3k neurons", "quantised, 3k neurons",
-    ]  # fmt: skip
+    found = ssp_kitti(shared / "data" / "kitti_00", tmp_path, seconds=2.0, budgets=(3600,))
+    rows = {row["integrator"]: row for row in found["rows"]}
+    assert {name: row["neurons"] for name, row in rows.items()} == {
+        "plain, 3k neurons": 3600,
+        "plain, 3k neurons, velocity in neurons": 4100,
+        "quantised, 3k neurons": 3600,
+        "quantised, 3k neurons, velocity in neurons": 4100,
+    }
+    for name in ("plain, 3k neurons", "quantised, 3k neurons"):
+        assert rows[name]["rmse"] != rows[f"{name}, velocity in neurons"]["rmse"]
     assert found["metres_per_unit"] > 200
     assert pictures(tmp_path) == {"reckoning.png"}
 
 
 def test_any_kitti_sequence_with_poses_is_chosen_by_its_number(tmp_path, monkeypatch, mistake):
-    short = partial(ssp_kitti, seconds=1.0, budgets=(3600,))
+    short = partial(ssp_kitti, seconds=0.5, budgets=(3600,))
     monkeypatch.setattr("neuroslam.experiments.ssp_kitti.ssp_kitti", short)
     for folder, bend in (("kitti_07", 0.0), ("poses", 1.0)):
         s = np.linspace(0.0, 1.0, 40)
@@ -80,7 +86,7 @@ def test_any_kitti_sequence_with_poses_is_chosen_by_its_number(tmp_path, monkeyp
     for number in ("07", "05"):
         out = tmp_path / f"out_{number}"
         rows = run_experiment("ssp-kitti", tmp_path, out, sequence=number)
-        assert [row["neurons"] for row in rows] == [3600, 3600]
+        assert [row["neurons"] for row in rows] == [3600, 4100] * 2
         assert json.loads((out / "results.json").read_text("utf-8"))["sequence"] == number
         assert pictures(out) == {"reckoning.png"}
     command = ("experiment", "--data", tmp_path, "-o", tmp_path / "out", "--sequence")
