@@ -11,6 +11,10 @@ frame of the present one, and the experiences :math:`N` near a pose, farther whe
 drifted for longer. This is the sequence of SeqSLAM (:mod:`neuroslam.view.sequence`) along the
 robot's own path instead of a straight line, so it also holds where the path branches or speed
 changes.
+
+Where odometry is poor the path comes to lie beside the map, so evidence is also accumulated along
+the links of the map, as while mapping (:mod:`neuroslam.mapping.sequence`). Either is enough; a
+belief by the links has to show the same place for longer.
 """
 
 from collections import deque
@@ -21,6 +25,8 @@ import numpy as np
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.errors import BadFrame, MapError
 from neuroslam.geometry import compose, compose_poses, integrate_velocities, relative_poses
+from neuroslam.mapping.experience import ExperienceMap
+from neuroslam.mapping.sequence import advance_costs, relative_errors, within_links
 from neuroslam.merging.limits import WINDOW, tolerance
 from neuroslam.odometry.visual import VisualOdometry
 from neuroslam.sensors.frames import check_instant, checked_odometry
@@ -38,8 +44,20 @@ those that are reported."""
 AGREE = 3
 """Frames in a row whose evidence must agree before the robot is found, or found elsewhere."""
 
+LINKS_LARGEST_SHARE = {True: 0.8, False: 0.7}
+"""Evidence along the links for a belief: largest mean match error as a share of that with all
+experiences, for views of gradients and for others, whose errors differ more between places."""
+
+LINKS_LEAST_LEAD, LINKS_AGREE = 0.3, 4
+"""Lead over any other part of the map in standard deviations, and frames in a row that agree."""
+
 LEAST_FRAMES, LEAST_PATH = 8, 0.5
 """Frames of a path that are evidence, and its length in sizes of an experience."""
+
+_MEMORY = 14  # frames over which evidence along the links is averaged
+_APART = 6  # links within which experiences are the same part of the map
+_AHEAD = (2, 4)  # links behind and ahead at which successive frames agree
+_SAME = 2.5  # and distance, in median links, within which they are
 
 _CANDIDATES = 100  # experiences that resemble the present frame most
 _NEIGHBOURS = 4  # experiences near a pose that are compared with a frame
@@ -84,6 +102,68 @@ class _Laid(NamedTuple):
     scores: np.ndarray
     errors: np.ndarray
     shares: np.ndarray
+
+
+class _OnLinks(NamedTuple):
+    """Where the evidence along the links says that the robot is.
+
+    Attributes:
+        experience: The one with most evidence.
+        ratio: That of the best elsewhere over it, in [0, 1].
+        believed: Whether it is enough for a belief.
+    """
+
+    experience: int
+    ratio: float
+    believed: bool
+
+
+class _LinkEvidence:
+    """Evidence of successive frames along the links of a map."""
+
+    def __init__(self, map_: ExperienceMap, largest_share: float) -> None:
+        self.largest_share = largest_share
+        self.source, self.target = (
+            map_.links_table.array(name).copy() for name in ("source", "target")
+        )
+        self.xy = map_.poses[:, :2].copy()
+        lengths_m = map_.links_table.array("distance_m")
+        self.same_m = _SAME * float(np.median(lengths_m)) if len(lengths_m) else 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin again: the robot may be anywhere."""
+        self.costs = np.zeros(len(self.xy))
+        self.frames, self.agreeing, self.before = 0, 0, NO_EXPERIENCE
+        self.share = 0.0
+
+    def add(self, errors: np.ndarray) -> _OnLinks:
+        """Take in the match errors of a frame with all experiences, ``(n,)``."""
+        relative = relative_errors(errors, np.ones(len(errors), dtype=bool))
+        memory = min(1.0 - 1.0 / _MEMORY, self.frames / (self.frames + 1.0))
+        self.costs = advance_costs(self.costs, relative, self.source, self.target, memory)
+        best = int(self.costs.argmin())
+        share = float(errors[best] / errors.mean())
+        self.share += (1.0 - memory) * (share - self.share)
+        self.frames += 1
+        follows = self.before != NO_EXPERIENCE and self._near(self.before, *_AHEAD)[best]
+        self.agreeing = self.agreeing + 1 if follows else 0
+        self.before = best
+        rival = self.costs.min(where=~self._near(best, _APART, _APART), initial=0.0)
+        lead = rival - self.costs[best]
+        believed = (
+            self.frames >= LEAST_FRAMES
+            and self.agreeing >= LINKS_AGREE
+            and self.share <= self.largest_share
+            and lead >= LINKS_LEAST_LEAD
+        )
+        ratio = float(np.clip(rival / min(self.costs[best], -1e-9), 0.0, 1.0))
+        return _OnLinks(best, ratio, believed)
+
+    def _near(self, experience: int, back: int, ahead: int) -> np.ndarray:
+        links = within_links(experience, back, ahead, self.source, self.target, len(self.xy))
+        apart_m = np.hypot(*(self.xy - self.xy[experience]).T)
+        return np.asarray(links | (apart_m <= self.same_m))
 
 
 class Localiser:
@@ -132,8 +212,11 @@ class Localiser:
         self._tree = cKDTree(self._points)
         self._odometry = VisualOdometry(self.config.odometry, self.config.view.grey)
         self._path: deque[_Seen] = deque(maxlen=FRAMES)
+        share = LINKS_LARGEST_SHARE[bool(self.config.view.orientations)]
+        self._links = _LinkEvidence(brain.map, share)
         self._here, self._path_m = Pose(0.0, 0.0, 0.0), 0.0
         self._time_s: float | None = None
+        self._moves = False
         self._belief: tuple[Pose, int, float, float] | None = None  # pose, id, confidence, path
         self._agreeing: list[tuple[Pose, Pose]] = []  # laid and driven poses of the last evidence
 
@@ -152,19 +235,17 @@ class Localiser:
         self._move(frame)
         estimate = self._estimate(frame)
         if estimate is None:
-            error, share, ratio, laid = np.nan, 1.0, 1.0, None
-        else:
-            experience, turn_rad, error, share, ratio = estimate
-            x_m, y_m, theta_rad = self.poses[experience].tolist()
-            laid = Pose(x_m, y_m, theta_rad + turn_rad)
-        good = (
-            laid is not None
-            and share <= LARGEST_ERROR
-            and ratio <= LARGEST_RATIO
-            and len(self._path) >= LEAST_FRAMES
-            and self._path[-1].path_m - self._path[0].path_m >= LEAST_PATH * self.place_m
-        )
-        if good and laid is not None and self._agrees(laid):
+            self._agreeing.clear()
+            return self._answer(frame, np.nan, 1.0)
+        experience, turn_rad, error, share, ratio, on_links = estimate
+        far = self._path[-1].path_m - self._path[0].path_m >= LEAST_PATH * self.place_m
+        enough = far and len(self._path) >= LEAST_FRAMES
+        good = enough and share <= LARGEST_ERROR and ratio <= LARGEST_RATIO
+        if not good and far and on_links is not None and on_links.believed:
+            good, experience, ratio = True, on_links.experience, on_links.ratio
+        x_m, y_m, theta_rad = self.poses[experience].tolist()
+        laid = Pose(x_m, y_m, theta_rad + turn_rad)
+        if good and self._agrees(laid):
             self._belief = laid, experience, 1.0 - ratio, self._path_m
         elif not good:
             self._agreeing.clear()
@@ -188,9 +269,11 @@ class Localiser:
         self._time_s = frame.time_s
         if dt_s > self.config.max_gap_s:  # the motion in the gap is unknown
             self._path.clear()
+            self._links.forget()
             self._agreeing.clear()
             self._belief = None
             return
+        self._moves = velocity != (0.0, 0.0)
         moved = integrate_velocities(
             np.array([velocity.v_m_s]), np.array([velocity.w_rad_s]), np.array([dt_s])
         )
@@ -201,7 +284,9 @@ class Localiser:
             pose, experience, confidence, since_m = self._belief
             self._belief = compose(pose, step), experience, confidence, since_m
 
-    def _estimate(self, frame: Frame) -> tuple[int, float, float, float, float] | None:
+    def _estimate(
+        self, frame: Frame
+    ) -> tuple[int, float, float, float, float, _OnLinks | None] | None:
         """Lay the path; return experience, relative heading, match error, its share, and ratio."""
         view = None if frame.image is None else self.brain.view.usable_view(frame.image)
         if view is None:
@@ -221,7 +306,11 @@ class Localiser:
             others = self._lay(elsewhere, turns_rad).scores if len(elsewhere) else np.zeros(1)
             ratio = float(np.clip(others.min() / laid.scores[best], 0.0, 1.0))
         error, share = float(laid.errors[best]), float(laid.shares[best])
-        return int(self._own[near[best]]), float(turns_rad[near[best]]), error, share, ratio
+        on_links = None
+        if self._moves:
+            on_links = self._links.add(np.append(errors, 1.0)[self._templates])
+        at, turn_rad = int(self._own[near[best]]), float(turns_rad[near[best]])
+        return at, turn_rad, error, share, ratio, on_links
 
     @staticmethod
     def _resembling(z: np.ndarray, among: np.ndarray) -> np.ndarray:

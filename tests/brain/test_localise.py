@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neuroslam import BrainConfig, NavigationBrain, open_source, save_brain
-from neuroslam.brain.localise import AGREE, LEAST_FRAMES, Localiser
+from neuroslam.brain.localise import AGREE, LEAST_FRAMES, LINKS_LARGEST_SHARE, Localiser
 from neuroslam.errors import BadFrame, MapError
 from neuroslam.types import Frame, Velocity
 
@@ -68,6 +68,21 @@ def test_a_panorama_finds_a_robot_that_drives_the_other_way():
     assert abs(int(brain.map.experiences["first_frame"][found.experience]) - 40) <= 5
     heading = brain.map.poses[found.experience, 2]
     assert abs(math.remainder(found.pose.theta_rad - heading - math.pi, 2 * math.pi)) < 0.3
+
+
+def test_a_robot_whose_odometry_is_wrong_is_found_by_the_links_of_the_map(brain, monkeypatch):
+    frames = [
+        frame._replace(velocity=Velocity(0.3 * frame.velocity.v_m_s, 2.0))
+        for frame in open_source(WORLD + "&gain=0.8&seed=3").frames(40, 60)
+    ]
+    localiser = Localiser(brain)
+    last = [localiser(frame) for frame in frames][-1]
+    assert last.pose is not None
+    first = int(brain.map.experiences["first_frame"][last.experience]) % 110
+    assert abs(first - frames[-1].index) <= 5
+    monkeypatch.setitem(LINKS_LARGEST_SHARE, False, 0.0)
+    by_path = Localiser(brain)
+    assert all(by_path(frame).pose is None for frame in frames)
 
 
 def test_a_robot_in_another_world_is_not_found(brain):
