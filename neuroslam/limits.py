@@ -107,6 +107,21 @@ def is_bomb(compressed: int, whole: int) -> bool:
     return whole > max(_FREE_RATIO_BYTES, _MOST_RATIO * compressed)
 
 
+def check_regular(path: Path) -> int:
+    """Return the size of a regular file in bytes; to open a pipe would wait for a writer.
+
+    Raises:
+        NotReadableError: If it is a folder, a device or a pipe.
+        OSError: If there is none.
+    """
+    about = path.stat()
+    if stat.S_ISDIR(about.st_mode):
+        raise NotReadableError("is a folder; expected a file")
+    if not stat.S_ISREG(about.st_mode):
+        raise NotReadableError("is a device or a pipe; expected a regular file")
+    return about.st_size
+
+
 def read_bounded(path: Path, most: int = MOST_FILE_BYTES) -> bytes:
     """Read a whole file, if it is a regular one and not too large.
 
@@ -118,15 +133,9 @@ def read_bounded(path: Path, most: int = MOST_FILE_BYTES) -> bytes:
         NotReadableError: If it must not be read; the message says why.
         OSError: If it cannot be read.
     """
-    about = path.stat()
-    if stat.S_ISDIR(about.st_mode):
-        raise NotReadableError("is a folder; expected a file")
-    if not stat.S_ISREG(about.st_mode):  # to open a pipe would wait for a writer
-        raise NotReadableError("is a device or a pipe; expected a regular file")
-    if about.st_size > most:
-        raise NotReadableError(
-            f"has {size_text(about.st_size)}; expected at most {size_text(most)}"
-        )
+    size = check_regular(path)
+    if size > most:
+        raise NotReadableError(f"has {size_text(size)}; expected at most {size_text(most)}")
     with path.open("rb") as file:
         return file.read(most)
 

@@ -19,6 +19,7 @@ from neuroslam.sensors.images import (
     read_text,
 )
 from neuroslam.sensors.mrclam import is_mrclam, open_mrclam
+from neuroslam.sensors.options import split_track
 from neuroslam.sensors.rosbag import is_bag, open_bag
 from neuroslam.sensors.sightings import (
     SightingsSource,
@@ -28,7 +29,13 @@ from neuroslam.sensors.sightings import (
 )
 from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
-from neuroslam.sensors.tracks import TrackSource, parse_motion, read_positions, read_track
+from neuroslam.sensors.tracks import (
+    TrackSource,
+    header_and_rows,
+    parse_motion,
+    read_positions,
+    read_track,
+)
 from neuroslam.sensors.video import VIDEO_SUFFIXES, VideoSource
 from neuroslam.types import GreyRule
 
@@ -205,7 +212,7 @@ def absolute_spec(spec: str) -> str:
         name = str(Path(name).resolve()) if name.lower().endswith(".npz") else name
         return f"arena:{name}{mark}{query}"
     if spec.startswith("track:"):
-        name, mark, query = spec.removeprefix("track:").partition("?")
+        name, mark, query = split_track(spec)
         return f"track:{Path(name).resolve()}{mark}{query}"
     if spec.startswith(_PREFIXES) or ("://" in spec and not Path(spec).exists()):
         return spec
@@ -300,7 +307,7 @@ def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     for row in _first_rows(text, 10):
         if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz, grey)
-    if any(is_sightings(row) for row in _first_rows(text, 1)):
+    if is_sightings(header_and_rows(text, str(path))[0]):
         return parse_sightings(text, str(path))
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
 

@@ -1,5 +1,6 @@
 """Parses the options after the ``?`` of a source's name, as in ``world:town?laps=2``."""
 
+from pathlib import Path
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -55,3 +56,17 @@ def parse_options(source: str, query: str, model: type[Options]) -> Options:
         raise SourceError(
             f"{source}: option {name}={values[name]!r}: {problem} ({meaning})"
         ) from None
+
+
+def split_track(spec: str) -> tuple[str, str, str]:
+    """Split the name of a track into file, ``?`` and options; a file may have a ``?`` in its name.
+
+    Example:
+        >>> split_track("track:rat.csv?units=cm")
+        ('rat.csv', '?', 'units=cm')
+    """
+    whole = spec.removeprefix("track:")
+    name, mark, query = whole.rpartition("?")
+    if not mark or Path(whole).is_file():
+        return whole, "", ""
+    return name, mark, query

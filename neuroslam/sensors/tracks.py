@@ -26,7 +26,14 @@ import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.geometry import wrap_angles
-from neuroslam.limits import NotReadableError, fits, is_bomb, size_text, too_much
+from neuroslam.limits import (
+    NotReadableError,
+    check_regular,
+    fits,
+    is_bomb,
+    size_text,
+    too_much,
+)
 from neuroslam.sensors.source import IndexedSource
 from neuroslam.sensors.times import (
     TimeColumn,
@@ -41,14 +48,20 @@ from neuroslam.types import Frame, Pose, Velocity
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
 _TRUTH = ("x_m", "y_m", "theta_rad")
-_MAX_SPEED = 1e6  # m/s, rad/s: only a damaged log has more, and its sums could overflow
 _MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
 _COPIES = 4  # of positions: as they are, as numbers, velocities and poses
 _EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s and x_m,y_m,theta_rad"
 
 
+MAX_SPEED = 1e6
+"""In m/s and rad/s: only a damaged log has more, and its sums could overflow."""
+
 SLOWEST_S = 10.0
 """Longest step of times that a format defines in seconds; a longer one shows another unit."""
+
+
+SLOW_S = 1.0
+"""Longest step of times in seconds that is not reported."""
 
 
 class Clock:
@@ -108,6 +121,21 @@ def rising(times_s: np.ndarray) -> np.ndarray:
     return np.asarray(np.isfinite(times_s) & (times_s > _latest_before(times_s)))
 
 
+def usable_times(times_s: np.ndarray) -> np.ndarray:
+    """Return which times of a track to use, ``(n,)`` bool: they rise, and most are kept.
+
+    Those are the times later than all before, or those earlier than all after, so that one wrong
+    time costs its own row, whether it is too early or too late.
+
+    Example:
+        >>> usable_times(np.array([0.0, 99.0, 1.0, 2.0])).tolist()
+        [True, False, True, True]
+    """
+    early = rising(times_s)
+    late = rising(-times_s[::-1])[::-1]
+    return early if early.sum() >= late.sum() else late
+
+
 def _latest_before(times_s: np.ndarray) -> np.ndarray:
     """Return the latest finite time before each, ``(n,)``; -inf if there is none."""
     latest = np.maximum.accumulate(np.where(np.isfinite(times_s), times_s, -np.inf))
@@ -151,10 +179,10 @@ class Track:
             BadFrame: If the motion is not finite, or impossibly fast.
         """
         v, w = self.velocities[index].tolist()
-        if not (abs(v) <= _MAX_SPEED and abs(w) <= _MAX_SPEED):  # NaN too
+        if not (abs(v) <= MAX_SPEED and abs(w) <= MAX_SPEED):  # NaN too
             raise BadFrame(
                 f"{self.name}: frame {index} ({self.rows[index]}): its motion is v = {v} m/s, "
-                f"w = {w} rad/s; expected finite numbers, at most {_MAX_SPEED:,.0f}"
+                f"w = {w} rad/s; expected finite numbers, at most {MAX_SPEED:,.0f}"
             )
         return Velocity(v, w)
 
@@ -255,7 +283,7 @@ def parse_table(
         >>> parse_table("x_m,y_m\n1,2\n3,\n", "walk.csv", ("x_m", "y_m"), "").columns["y_m"]
         array([ 2., nan])
     """
-    header, numbered = _header_and_rows(text, name)
+    header, numbered = header_and_rows(text, name)
     if not header:
         raise SourceError(f"{name}: is empty; {expected}, and one line per frame")
     lowered = [field.strip().lstrip("#").strip().lower() for field in header]
@@ -267,11 +295,16 @@ def parse_table(
         columns = [column if column != "time_s" else "" for column in columns]
         columns[time.index] = "time_s"
     needed = [*needed, *(together if any(field in columns for field in together) else ())]
+    twice = [field for field in (*needed, *optional) if columns.count(field) > 1]
+    if twice:
+        raise SourceError(
+            f"{name}: has {columns.count(twice[0])} columns of {twice[0]}; expected one"
+        )
     missing = [field for field in needed if field not in columns]
     if missing:
         raise SourceError(
             f"{name}: has the columns {','.join(lowered)[:100]}, but no {missing[0]}; {expected}"
-            + _separator_note(header)
+            + separator_note(header)
         )
     if not numbered:
         raise SourceError(f"{name}: has a header, but no lines; expected one line per frame")
@@ -317,7 +350,7 @@ def parse_table(
     return Table(table, rows, notes)
 
 
-def _separator_note(header: list[str]) -> str:
+def separator_note(header: list[str]) -> str:
     """Return what to do about a header that other characters than commas separate."""
     for mark, what in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
         if len(header) == 1 and len(header[0].strip().split(mark)) > 1:
@@ -325,7 +358,7 @@ def _separator_note(header: list[str]) -> str:
     return ""
 
 
-def _header_and_rows(text: str, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def header_and_rows(text: str, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the header, and the rows with the number of their line, without comments."""
     reader = csv.reader(io.StringIO(text))
     try:
@@ -453,6 +486,12 @@ def read_positions(path: Path) -> Positions:
     if "t" in arrays:
         times, unit = in_seconds(arrays["t"], slowest_s=SLOWEST_S)
         notes = () if unit == "s" else (unit_note(f"{path}: t", None, unit),)
+        steps = np.diff(times[np.isfinite(times)])
+        if unit == "s" and len(steps) and np.median(steps) > SLOW_S:
+            notes = (
+                f"{path}: t advances by {np.median(steps):.3g} s a row; expected at most "
+                f"{SLOW_S:g} s: are the times in milliseconds?",
+            )
     return Positions(arrays, times, arrays["pos"].astype(np.float64), notes)
 
 
@@ -488,6 +527,7 @@ def motion_along(times_s: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray
 
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
+        check_regular(path)
         with path.open("rb") as file:
             _require_room(file, path)
             loaded = np.load(file, allow_pickle=False)

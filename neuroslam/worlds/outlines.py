@@ -14,6 +14,9 @@ from neuroslam.errors import SourceError
 from neuroslam.geometry import TWO_PI
 
 _FLAT_M = 1e-300  # rise of a side whose slope is finite
+MOST_VERTICES = 4000
+"""Of an outline; all pairs of its sides are compared."""
+
 TOUCH_M = 1e-9
 """A position nearer to a wall than this is at the wall, on its free side."""
 
@@ -43,7 +46,14 @@ def checked_outline(values: ArrayLike, name: str) -> np.ndarray:
     Raises:
         SourceError: If it has too few vertices, sides of length 0, or crosses itself.
     """
-    outline = np.array(values, dtype=np.float64)
+    try:
+        outline = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SourceError(f"{name} is not of numbers; expected metres") from None
+    if len(np.atleast_1d(outline)) > MOST_VERTICES:
+        raise SourceError(
+            f"{name} has {len(outline):,} vertices; expected at most {MOST_VERTICES:,}"
+        )
     if outline.shape != (3,) and (outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3):
         raise SourceError(
             f"{name} has shape {outline.shape}; expected (n, 2) vertices, at least 3, or the "

@@ -19,7 +19,7 @@ from neuroslam.compiled import compiled
 from neuroslam.errors import ConfigError, SourceError
 from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.images import read_text
-from neuroslam.sensors.tracks import motion_along, parse_table, read_positions, rising
+from neuroslam.sensors.tracks import motion_along, parse_table, read_positions, usable_times
 from neuroslam.worlds.arena import Arena
 
 ARENA_KEYS = ("vertices", "arena_radius")
@@ -159,7 +159,7 @@ class Walk:
 def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | None = None) -> Walk:
     """Read a recorded walk; the module's docstring describes its format.
 
-    Rows without numbers, or with a time that is not later than all before, are dropped and counted.
+    Rows without numbers, or with a time that does not rise, are dropped and counted.
 
     Args:
         path: An ``.npz`` or a CSV.
@@ -185,7 +185,7 @@ def read_walk(path: str | Path, minutes: float | None = None, rate_hz: float | N
     usable = np.isfinite(positions).all(axis=1)
     # The time of a row without a position does not count, so it cannot invalidate later rows.
     times_s = np.where(usable, times_s, np.nan)
-    usable &= rising(times_s)
+    usable &= usable_times(times_s)
     n = int(usable.sum())
     if n < 2:
         raise SourceError(
