@@ -19,18 +19,29 @@ which the robot measured; a stamp that is later than one further down is replace
 """
 
 import bz2
+import codecs
 import gzip
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from neuroslam.errors import BadFrame, SourceError, counted
 from neuroslam.geometry import wrap_angles
-from neuroslam.limits import MOST_FILE_BYTES, budget_bytes, is_bomb, read_bounded, too_much
+from neuroslam.limits import (
+    MOST_FILE_BYTES,
+    NotReadableError,
+    budget_bytes,
+    check_regular,
+    fits,
+    is_bomb,
+    too_much,
+)
 from neuroslam.sensors.full_turn import full_turn
 from neuroslam.sensors.source import IndexedSource
-from neuroslam.sensors.tracks import Clock
+from neuroslam.sensors.times import in_seconds, unit_note
+from neuroslam.sensors.tracks import MAX_SPEED, SLOWEST_S, Clock
 from neuroslam.types import Frame, GreyRule, Velocity
 
 MAX_RANGE_M = 80.0
@@ -38,6 +49,9 @@ MAX_RANGE_M = 80.0
 ``laser_max_range``."""
 
 _LASERS = (b"FLASER", b"ROBOTLASER1")
+_PER_BYTE = 12  # bytes of memory for each of a log: its lines, their poses
+_LOOKED_AT = 50  # lines that show what a file is
+_SCANS = 20  # of which the ranges are looked at
 
 
 class CarmenSource(IndexedSource):
@@ -57,13 +71,13 @@ class CarmenSource(IndexedSource):
         self.name = name
         kinds: dict[bytes, list[bytes]] = {kind: [] for kind in (*_LASERS, b"ODOM")}
         parameters: dict[bytes, bytes] = {}
-        for line in text.splitlines():
-            kind, _, rest = line.partition(b" ")
+        for line in text.removeprefix(codecs.BOM_UTF8).splitlines():
+            kind, *rest = line.split(None, 1)[:2] or [b""]
             if kind in kinds:
-                kinds[kind].append(rest)
+                kinds[kind].append(rest[0] if rest else b"")
             elif kind == b"PARAM":
-                key, _, value = rest.strip().partition(b" ")
-                parameters[key] = value.split()[0] if value.split() else b""
+                key, *value = b"".join(rest).split()[:2] or [b""]
+                parameters[key] = value[0] if value else b""
         self.kind = max(_LASERS, key=lambda kind: len(kinds[kind]))
         if not kinds[self.kind]:
             self.kind = b"ODOM"
@@ -78,7 +92,8 @@ class CarmenSource(IndexedSource):
         self._max_m = most if most > 0 else MAX_RANGE_M
         rows = np.array([_pose_and_times(line, self.kind) for line in self._lines])
         self.odometry = rows[:, :3]
-        times, late = _rising_times(_times(rows[:, 3:]))
+        seconds, unit = in_seconds(_times(rows[:, 3:]), slowest_s=SLOWEST_S)
+        times, late = _rising_times(seconds)
         self.clock = Clock(name, times, 20.0)
         self.n_frames = len(rows)
         self.frame_rate_hz = self.clock.frame_rate_hz
@@ -87,8 +102,16 @@ class CarmenSource(IndexedSource):
             f"{name}: {counted(len(rows), f'{what} message')}; its motion is the change of the "
             "odometry between them",
         )
+        if unit != "s":
+            self.notes += (unit_note(name, None, unit),)
         if late:
-            self.notes += (f"{name}: {counted(late, 'time')} did not rise and were interpolated",)
+            what = counted(late, "time that did not rise was", "times that did not rise were")
+            self.notes += (f"{name}: {what} interpolated",)
+        if self.kind != b"ODOM" and not self._any_range():
+            self.notes += (
+                f"{name}: no beam of the scans looked at is below {self._max_m:g} m: are the "
+                "ranges in centimetres or millimetres?",
+            )
         if self.laser_ahead_m and self.kind != b"ODOM":
             self.notes += (
                 f"{name}: the laser is {self.laser_ahead_m:g} m ahead of the robot's centre; "
@@ -104,7 +127,24 @@ class CarmenSource(IndexedSource):
                 f"{self.name}: frame {index}: its {self.kind.decode()} line ends with "
                 f"{self._lines[index][-40:].decode(errors='replace')!r}; expected a pose and times"
             )
-        return Frame(index, time_s, velocity=self._velocity(index), ranges=self._ranges(index))
+        velocity = self._velocity(index)
+        if not (abs(velocity.v_m_s) <= MAX_SPEED and abs(velocity.w_rad_s) <= MAX_SPEED):
+            raise BadFrame(
+                f"{self.name}: frame {index}: its odometry jumps by {velocity.v_m_s:.3g} m/s; "
+                f"expected at most {MAX_SPEED:,.0f} m/s"
+            )
+        try:
+            return Frame(index, time_s, velocity=velocity, ranges=self._ranges(index))
+        except BadFrame as error:
+            raise BadFrame(f"{self.name}: frame {index}: {error}") from None
+
+    def _any_range(self) -> bool:
+        """Return whether a beam of some scans hits anything, or no scan can be read."""
+        scans = []
+        for index in np.linspace(0, self.n_frames - 1, min(_SCANS, self.n_frames)).astype(int):
+            with suppress(BadFrame):
+                scans.append(self._ranges(int(index)))
+        return not scans or any(np.isfinite(scan).any() for scan in scans if scan is not None)
 
     def _velocity(self, index: int) -> Velocity:
         """Return speed and turn rate from the last sound pose before a frame to its own."""
@@ -138,8 +178,8 @@ class CarmenSource(IndexedSource):
                 raise ValueError("beams")
         except (ValueError, IndexError):
             raise BadFrame(
-                f"{self.name}: frame {index}: its {self.kind.decode()} line holds no scan; "
-                "expected a number of beams and as many ranges"
+                f"its {self.kind.decode()} line holds no scan; expected a number of beams and as "
+                "many ranges"
             ) from None
         return full_turn(beams, first, step, 0.0, np.nextafter(most, 0.0))
 
@@ -163,27 +203,31 @@ def is_carmen(path: Path) -> bool:
         return True
     if not name.endswith(".log"):
         return False
-    lines = _unpacked(path).splitlines()[:50]
-    kinds = [line.partition(b" ")[0] for line in lines]
-    return any(kind in (*_LASERS, b"ODOM") for kind in kinds)
+    lines = _unpacked(path, _LOOKED_AT << 14).splitlines()[:_LOOKED_AT]
+    kinds = [line.split(None, 1)[:1] for line in lines]
+    return any(kind in ([b"FLASER"], [b"ROBOTLASER1"], [b"ODOM"]) for kind in kinds)
 
 
-def _unpacked(path: Path) -> bytes:
-    """Return the bytes of a file, unpacked if it is compressed."""
+def _unpacked(path: Path, most: int | None = None) -> bytes:
+    """Return the bytes of a file, unpacked if it is compressed, or the first ``most``."""
+    whole = most is None
     try:
+        size = check_regular(path)
         name = path.name.lower()
-        if not name.endswith((".bz2", ".gz")):
-            return read_bounded(path)
-        most = min(MOST_FILE_BYTES, budget_bytes())
-        opener = bz2.open if name.endswith(".bz2") else gzip.open
-        with opener(path) as file:
-            text = file.read(most + 1)
-        if len(text) > most:
-            raise SourceError(f"{path}: {too_much(len(text))}")
-        if is_bomb(path.stat().st_size, len(text)):
-            raise SourceError(f"{path}: unpacks to {len(text):,} bytes; expected a log")
+        opener = bz2.open if name.endswith(".bz2") else gzip.open if name.endswith(".gz") else open
+        if most is None:
+            most = min(MOST_FILE_BYTES, budget_bytes() // _PER_BYTE)
+        with opener(path, "rb") as file:
+            text = bytes(file.read(most + 1))
     except (EOFError, zlib.error, OSError, ValueError) as error:
-        raise SourceError(f"{path}: cannot be read ({error})") from None
+        what = error if isinstance(error, NotReadableError) else f"cannot be read ({error})"
+        raise SourceError(f"{path}: {what}") from None
+    if whole and is_bomb(size, len(text)):
+        raise SourceError(f"{path}: unpacks to {len(text):,} bytes; expected a log")
+    if whole and len(text) > most:
+        needed = _PER_BYTE * max(len(text), size)
+        why = too_much(needed) if not fits(needed) else f"has more than {most:,} bytes"
+        raise SourceError(f"{path}: {why}")
     return text
 
 

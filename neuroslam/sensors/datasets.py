@@ -35,6 +35,7 @@ from neuroslam.sensors.images import (
     read_text,
 )
 from neuroslam.sensors.times import in_seconds, parse_time, unit_note
+from neuroslam.sensors.tracks import SLOWEST_S, time_text
 from neuroslam.sensors.tub import is_tub, open_tub
 from neuroslam.types import GreyRule
 
@@ -96,6 +97,7 @@ def open_tum(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Image
         forward = rotate(rows[:, 4:8], np.array([0.0, 0.0, 1.0]))
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
         truth = at_times(known_s, poses, times)
+        notes += no_truth(str(truth_file), truth, known_s, times)
         option = f"run with --truth {truth_file} --axes camera"
         if note := axes_note(str(truth_file), rows[:, 1:4], option):
             notes.append(note)
@@ -157,30 +159,72 @@ def open_kitti_raw(path: Path, frame_rate_hz: float, grey: GreyRule = "luma") ->
     if not names:
         raise SourceError(f"{folder / 'data'}: contains no images; expected 0000000000.png")
     notes: list[str] = []
-    times, truth = _raw_times(folder / "timestamps.txt"), None
-    files = sorted((path / "oxts" / "data").glob("*.txt"))
-    known = _raw_times(path / "oxts" / "timestamps.txt")
-    if files and times is not None and known is not None and len(known) == len(files):
-        rows = np.array([_table(file, 6, notes)[0] for file in files])
-        lat, lon = np.radians(rows[:, 0]), np.radians(rows[:, 1])
-        scale_m = np.cos(lat[0]) * _EARTH_M
-        x, y = scale_m * lon, scale_m * np.log(np.tan(np.pi / 4.0 + lat / 2.0))
-        begin_s = times[0]
-        truth = at_times(
-            known - begin_s, np.column_stack([x - x[0], y - y[0], rows[:, 5]]), times - begin_s
-        )
-        notes.append(
-            f"{path / 'oxts'}: GPS and IMU are the truth; the motion is that of the images"
-        )
+    times, truth = _raw_times(folder / "timestamps.txt", notes), None
     if times is not None:
-        times = times - times[0]
+        times = _of_numbers(times, names, folder, notes)
+        finite = times[np.isfinite(times)]
+        begin_s = finite[0] if len(finite) else 0.0
+        times = times - begin_s
+        oxts = path / "oxts"
+        known = _raw_times(oxts / "timestamps.txt", notes)
+        files = sorted((oxts / "data").glob("*.txt"))
+        if known is not None and files:
+            known = _of_numbers(known, [file.name for file in files], oxts, notes) - begin_s
+            poses = _gps_poses(files, oxts, notes)
+            truth = at_times(known, poses, times)
+            notes.append(f"{oxts}: GPS and IMU are the truth; the motion is that of the images")
+            notes += no_truth(str(oxts), truth, known, times)
     images = [ImageFile(name, folder / "data" / name) for name in names]
     return ImageSource(
         str(path), images, times, frame_rate_hz, truth=truth, grey=grey, notes=tuple(notes)
     )
 
 
-def _raw_times(path: Path) -> np.ndarray | None:
+def _gps_poses(files: list[Path], oxts: Path, notes: list[str]) -> np.ndarray:
+    """Return the pose of each file of OXTS on the ground, ``(n, 3)``, NaN where it has none."""
+    rows, faults = np.full((len(files), 6), np.nan), []
+    for k, file in enumerate(files):
+        try:
+            row = _table(file, 6, [])[0]
+            if not 0.0 < abs(row[0]) < 85.0 or abs(row[1]) > 180.0:
+                raise SourceError(f"{file}: latitude {row[0]:g}, longitude {row[1]:g}; no position")
+            rows[k] = row
+        except SourceError as fault:
+            faults.append(str(fault))
+    usable = np.isfinite(rows).all(axis=1)
+    if not usable.any():
+        raise SourceError(f"{oxts}: no file has a pose, the first: {faults[0]}")
+    if faults:
+        notes.append(lost_rows(str(oxts), faults, len(files)))
+    lat, lon = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+    first = int(usable.argmax())
+    scale_m = np.cos(lat[first]) * _EARTH_M
+    x, y = scale_m * lon, scale_m * np.log(np.tan(np.pi / 4.0 + lat / 2.0))
+    return np.column_stack([x - x[first], y - y[first], rows[:, 5]])
+
+
+def _of_numbers(
+    times_s: np.ndarray, names: list[str], folder: Path, notes: list[str]
+) -> np.ndarray:
+    """Return the time of each file; if some are missing, by the numbers that are their names.
+
+    Raises:
+        SourceError: If there are more files than times, or their names are no numbers.
+    """
+    if len(times_s) == len(names):
+        return times_s
+    stems = [name.partition(".")[0] for name in names]
+    numbers = [int(stem) if stem.isascii() and stem.isdigit() else -1 for stem in stems]
+    if min(numbers) < 0 or max(numbers) >= len(times_s):
+        raise SourceError(
+            f"{folder}: {len(times_s)} times for {counted(len(names), 'file')}; expected one each"
+        )
+    missing = counted(len(times_s) - len(names), "file is", "files are")
+    notes.append(f"{folder}: {missing} missing of {len(times_s)}; the others keep their times")
+    return times_s[numbers]
+
+
+def _raw_times(path: Path, notes: list[str]) -> np.ndarray | None:
     if not path.is_file():
         return None
     lines = read_text(path).split("\n")
@@ -189,7 +233,10 @@ def _raw_times(path: Path) -> np.ndarray | None:
         raise SourceError(
             f"{path}: has no times; expected lines like 2011-09-26 13:02:25.594360375"
         )
-    return np.array(times)
+    times_s, unit = in_seconds(np.array(times), slowest_s=SLOWEST_S)
+    if unit != "s":
+        notes.append(unit_note(str(path), None, unit))
+    return times_s
 
 
 def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> ImageSource:
@@ -202,9 +249,9 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
     lines = [line.split(",") for line in read_text(camera / "data.csv").splitlines()]
     lines = [line for line in lines if line[0].strip() and not line[0].startswith("#")]
     try:
-        times = np.array([int(line[0]) for line in lines], dtype=np.int64) / 1e9
+        stamps = [float(line[0]) for line in lines]
         names = [line[1].strip() for line in lines]
-    except (ValueError, IndexError, OverflowError):
+    except (ValueError, IndexError):
         raise SourceError(
             f"{camera / 'data.csv'}: is damaged; expected lines 'time in ns,image file'"
         ) from None
@@ -212,6 +259,7 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
         raise SourceError(f"{camera / 'data.csv'}: lists no images; expected one per line")
     images = [ImageFile(name, camera / "data" / name) for name in names]
     truth, notes = None, []
+    times = _nanoseconds(np.array(stamps), str(camera / "data.csv"), notes)
     truth_file = next((f for t in _TRUTHS if (f := mav / t / "data.csv").is_file()), None)
     if truth_file is not None:
         rows = _table(truth_file, 8, notes, ",")
@@ -219,9 +267,47 @@ def open_euroc(mav: Path, frame_rate_hz: float, grey: GreyRule = "luma") -> Imag
         axis = _axis_in_chain(chain) if chain.is_file() else _optical_axis(camera / "sensor.yaml")
         forward = rotate(rows[:, [5, 6, 7, 4]], axis)  # EuRoC writes w first
         poses = _on_ground(rows[:, 1], rows[:, 2], forward[:, 0], forward[:, 1])
-        truth = at_times(rows[:, 0] / 1e9, poses, times)
+        known_s = _nanoseconds(rows[:, 0], str(truth_file), notes)
+        truth = at_times(known_s, poses, times)
+        notes += no_truth(str(truth_file), truth, known_s, times)
+        option = f"convert it and run with --truth FILE --axes camera, or leave {truth_file} out"
+        if note := axes_note(str(truth_file), rows[:, 1:4], option):
+            notes.append(note)
     return ImageSource(
         str(mav.parent), images, times, frame_rate_hz, truth=truth, grey=grey, notes=tuple(notes)
+    )
+
+
+def _nanoseconds(times: np.ndarray, name: str, notes: list[str]) -> np.ndarray:
+    """Convert times that should be in nanoseconds to seconds, and note another unit."""
+    times_s, unit = in_seconds(times, slowest_s=SLOWEST_S)
+    if unit != "ns" and len(times) > 1:
+        notes.append(unit_note(name, None, unit))
+    return times / 1e9 if unit == "ns" or len(times) == 1 else times_s
+
+
+def no_truth(
+    name: str, truth: np.ndarray, known_s: np.ndarray, times_s: np.ndarray
+) -> tuple[str, ...]:
+    """Return a note if no frame has a true pose.
+
+    Args:
+        name: File of the truth.
+        truth: Poses of the frames, ``(m, 3)``, NaN where unknown.
+        known_s: Times of the truth in seconds.
+        times_s: Times of the frames.
+    """
+    if np.isfinite(truth).all(axis=1).any():
+        return ()
+    spans = [
+        f"{time_text(float(np.nanmin(t)))} to {time_text(float(np.nanmax(t)))}"
+        if np.isfinite(t).any()
+        else "no time"
+        for t in (known_s, times_s)
+    ]
+    return (
+        f"{name}: no frame has a true pose: it spans {spans[0]}, the frames {spans[1]}; expected "
+        "one clock",
     )
 
 

@@ -8,6 +8,9 @@ from neuroslam.geometry import TWO_PI, wrap_angles
 N_RANGES = 360
 """Number of bearings to which a scan is resampled, evenly over the full turn."""
 
+_MOST_RAD = 1.1 * TWO_PI  # some lasers cover a turn and a little more
+_LEAST_RAD = 1e-6  # step of a scan with six million beams
+
 
 def full_turn(
     ranges: np.ndarray, first_rad: float, step_rad: float, min_m: float, max_m: float
@@ -26,7 +29,7 @@ def full_turn(
         nearest in bearing; ``inf`` if no beam is within one step, or its distance is invalid.
 
     Raises:
-        BadFrame: If there are no beams, or their bearings are not numbers.
+        BadFrame: If there are no beams, or their bearings are not numbers or exceed a turn.
 
     Example:
         >>> turn = full_turn(np.array([1.0, 2.0, 3.0]), -np.pi / 2, np.pi / 2, 0.1, 10.0)
@@ -38,6 +41,12 @@ def full_turn(
         raise BadFrame(
             f"scan of {len(distances)} beams from {first_rad} rad in steps of {step_rad} rad; "
             "expected beams in steps other than 0"
+        )
+    extent = abs(step_rad) * (len(distances) - 1)
+    if extent > _MOST_RAD or abs(first_rad) > _MOST_RAD or abs(step_rad) < _LEAST_RAD:
+        raise BadFrame(
+            f"scan of {len(distances)} beams from {first_rad:.4g} rad in steps of {step_rad:.4g} "
+            "rad; expected one turn: are its angles in degrees?"
         )
     distances = np.where((distances >= min_m) & (distances <= max_m), distances, np.inf)
     bearings = np.arange(N_RANGES) * (TWO_PI / N_RANGES)
