@@ -54,13 +54,16 @@ class _Commands(TyperGroup):
             raise typer.Abort from None
 
 
+_WIDEST_HELP = 1000
+"""Columns; help is as wide as the terminal, and not at most 80 columns."""
+
 app = typer.Typer(
     cls=_Commands,
     help="Brain-inspired SLAM: from a video to a map.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"max_content_width": _WIDEST_HELP},
 )
 
 
@@ -109,7 +112,7 @@ for _name, _command in _COMMANDS.items():
     # A position such as -1,2 is no option.
     negative = {"ignore_unknown_options": _name == "plan"}
     app.command(_name, context_settings=negative)(
-        with_common_options(_command, heavy=_name != "presets")
+        with_common_options(_command, _name, heavy=_name != "presets")
     )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from neuroslam.cli.completion import complete_experiment
 from neuroslam.cli.options import (
     Assignments,
     BadFrame,
@@ -22,7 +23,7 @@ from neuroslam.cli.options import (
     Start,
     Stop,
 )
-from neuroslam.cli.output import REFUSED, USER_ERROR, complain, say
+from neuroslam.cli.output import REFUSED, USER_ERROR, complain, say, summarise
 from neuroslam.cli.progress import show_runs
 from neuroslam.cli.tables import across, down
 from neuroslam.errors import ConfigError, counted
@@ -87,6 +88,7 @@ def sweep_command(
                 done, total = so_far
                 say(f"{done} of {counted(total, 'run')} ended: {out / 'sweep.csv'}")
             raise
+    summarise(sources=sources, out=out, runs=rows)
     columns = ["templates", "experiences", "loop_closures", *counted_by_cells(rows), "ate_rmse_m"]
     if any(0 < row.get("frames_with_truth", 0) < row.get("frames", 0) for row in rows):
         columns.append("frames_with_truth")
@@ -143,6 +145,7 @@ def fleet_command(
             overwrite=overwrite,
             on_done=on_done,
         )
+    summarise(out=out, **report.to_dict())
     for row in report.sessions:
         size = "failed"
         if "frames" in row:
@@ -172,7 +175,12 @@ def fleet_command(
 
 def experiment_command(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="all, or one of: " + ", ".join(EXPERIMENTS))
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="all, or one of: " + ", ".join(EXPERIMENTS),
+            autocompletion=complete_experiment,
+        ),
     ],
     out: Out,
     data: Annotated[
@@ -213,6 +221,7 @@ def experiment_command(
             )
         lines = run_all(data, out, quick=quick, say=say)
         measured = sum(line.value is not None for line in lines)
+        summarise(experiment=name, out=out, values=[line._asdict() for line in lines])
         say(f"{counted(len(lines), 'value')} of the papers, {measured} measured")
         say(f"Written: {out / 'reproduction.md'}")
         return 0
@@ -220,6 +229,7 @@ def experiment_command(
         raise ConfigError("--quick: belongs to experiment all; leave it out")
     networks = dict(_name_and_file(text) for text in network or [])
     rows = run_experiment(name, data, out, jobs, ray, networks, sequence)
+    summarise(experiment=name, out=out, rows=rows)
     few = len({key for row in rows for key in row}) <= 9
     for table in [down(rows, name)] if few else across(rows, name):
         say(table)

@@ -32,10 +32,10 @@ from neuroslam.cli.options import (
     Truth,
     Units,
 )
-from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say
+from neuroslam.cli.output import INTERRUPTED, REFUSED, USER_ERROR, complain, say, summarise
 from neuroslam.cli.progress import show_frames
-from neuroslam.cli.tables import Table
-from neuroslam.errors import counted
+from neuroslam.cli.tables import Table, new_table
+from neuroslam.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     from neuroslam.config import BrainConfig
@@ -44,7 +44,10 @@ if TYPE_CHECKING:
 
 def run_command(
     source: Source,
-    out: Out,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder to write; required but for --dry-run."),
+    ] = None,
     preset: Preset = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
@@ -80,8 +83,16 @@ def run_command(
     ] = None,
     save_every: SaveEvery = 60.0,
     overwrite: Overwrite = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Print what would be read, and in which unit; write nothing."
+        ),
+    ] = False,
 ) -> int:
     """Map a SOURCE; write map, track and brain into a folder."""
+    if out is None and not dry_run:
+        raise ConfigError("Missing option '--out' / '-o': the folder to write")
     from neuroslam.brain import read_checkpoint
     from neuroslam.runs.activity import parse_record
     from neuroslam.runs.files import brain_file
@@ -98,6 +109,9 @@ def run_command(
     base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
     given = tuple(assignments or ())
     settings = resolve_config(preset, config, given, base)
+    if dry_run or out is None:
+        named = preset or ("of the stored map" if maps and config is None else "")
+        return _dry_run(source, out, settings, named, config, start, stop, offset, overwrite)
     if preset == "auto" or (preset is None and config is None and not maps):
         settings, preset = _estimated(source, config, given, stop, offset, settings, preset)
     with show_frames(source) as (on_start, on_step):
@@ -124,6 +138,47 @@ def run_command(
             record_rate_hz=rate,
         )
     return _report(summary, out, "run")
+
+
+def _dry_run(
+    source: str,
+    out: Path | None,
+    settings: "BrainConfig",
+    preset: str,
+    config: Path | None,
+    start: int,
+    stop: int | None,
+    offset: str | None,
+    overwrite: bool,
+) -> int:
+    """Print what a run would read; nothing is written."""
+    from neuroslam.runs.clocks import resolve_offset
+    from neuroslam.runs.files import require_free
+    from neuroslam.runs.survey import survey, unit_and_measure
+    from neuroslam.sensors.open import absolute_spec
+
+    source, found_offset = resolve_offset(source, offset, settings)
+    if out is not None:
+        require_free(out, absolute_spec(source), overwrite)
+    found = survey(source, settings, start=start, stop=stop)
+    unit = unit_and_measure(found, settings)
+    estimates = "images" in found.content and settings.view.features == "grey"
+    if not preset and config is None:
+        preset = "auto, estimated from the first laps" if estimates else "none, the defaults"
+    preset = preset or "none, the config file"
+    figures = found.to_dict() | {"source": source, "unit": unit, "preset": preset}
+    summarise(**figures, cells=settings.cells, out=out)
+    table = new_table("quantity", "value", title=f"{source}: what would be read", headed=False)
+    for name, value in found.rows():
+        table.add_row(name, value)
+    table.add_row("unit of the map", unit)
+    table.add_row("preset", preset)
+    table.add_row("cells", "+".join(settings.cells))
+    say(table)
+    for note in (*found_offset, *found.notes):
+        say(note)
+    say("Nothing is written: --dry-run")
+    return 0
 
 
 def _estimated(
@@ -210,6 +265,7 @@ def localise_command(
         on_bad_frame=on_bad_frame.value,
         overwrite=overwrite,
     )
+    summarise(map=stored, source=source, out=out, **vars(summary))
     frames = counted(summary.frames, "frame")
     if summary.first_found is None:
         say(f"Not found in the map in {frames}")
@@ -261,8 +317,10 @@ def merge_command(
     unit = units.pop() if len(units) == 1 else "m"
     for report in reports:
         _print_report(report.to_dict(), unit)
+    summarise(merged=summary is not None, unit=unit, reports=[one.to_dict() for one in reports])
     if summary is None:
         return REFUSED
+    summarise(out=out, **summary.to_dict())
     _print_not_joined(summary)
     say(f"Written: {out}")
     return 0
@@ -274,6 +332,7 @@ def demo_command(out: Out = Path("demo")) -> int:
 
     with show_frames("world:corridor") as (on_start, on_step):
         rows = demo(out, on_step, on_start)
+    summarise(out=out, figures=dict(rows), written=[out / "summary.png", out / "sessions.png"])
     table = Table(title="A corridor in two sessions, the second from an unknown start")
     table.add_column("quantity")
     table.add_column("value", justify="right")
@@ -290,6 +349,7 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
     from neuroslam.runs.reading import unit_of
 
     figures = summary.to_dict()
+    summarise(out=out, unit=unit_of(summary.measured), failure=summary.failure, **figures)
     for note in summary.notes:
         say(note)
     for warning in summary.warnings:

@@ -11,7 +11,9 @@ from typing import Annotated
 
 import typer
 
+from neuroslam.cli.completion import complete_assignment, complete_preset
 from neuroslam.cli.loading import load
+from neuroslam.cli.output import reporting
 from neuroslam.errors import ConfigError
 from neuroslam.limits import MAX_MEMORY, budget_bytes
 
@@ -112,14 +114,20 @@ RecordRate = Annotated[
     typer.Option("--rate", metavar="HZ", min=1e-6, help="Samples a second of --record."),
 ]
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
-Preset = Annotated[str | None, typer.Option(help="A preset; see `neuroslam presets`.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(help="A preset; see `neuroslam presets`.", autocompletion=complete_preset),
+]
 ConfigFile = Annotated[
     Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; overrides the preset.")
 ]
 Assignments = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="E.g. view.threshold=0.04; overrides both; repeatable."
+        "--set",
+        metavar="KEY=VALUE",
+        help="E.g. view.threshold=0.04; overrides both; repeatable.",
+        autocompletion=complete_assignment,
     ),
 ]
 Start = Annotated[int, typer.Option(help="First frame.")]
@@ -168,11 +176,28 @@ MaxMemory = Annotated[
 ]
 
 
-def with_common_options(command: Callable[..., int], *, heavy: bool = True) -> Callable[..., int]:
-    """Add ``--plugin`` and ``--max-memory`` to a command; they take effect before it runs.
+Quiet = Annotated[
+    bool,
+    typer.Option("--quiet", "-q", help="Print no progress and no results; errors and warnings."),
+]
+Json = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print the results as one JSON object; all else goes to standard error."
+    ),
+]
+
+
+def with_common_options(
+    command: Callable[..., int], name: str, *, heavy: bool = True
+) -> Callable[..., int]:
+    """Add the options that all commands have; they take effect before the command runs.
+
+    These are ``--plugin``, ``--max-memory``, ``--quiet`` and ``--json``.
 
     Args:
         command: The command.
+        name: Its name on the command line.
         heavy: Whether it needs the library with torch, which is then loaded first.
     """
 
@@ -181,9 +206,11 @@ def with_common_options(command: Callable[..., int], *, heavy: bool = True) -> C
         *args: object,
         plugin: list[Path] | None = None,
         max_memory: str | None = None,
+        quiet: bool = False,
+        as_json: bool = False,
         **options: object,
     ) -> int:
-        with _budget(max_memory):
+        with reporting(name, quiet=quiet, as_json=as_json) as now, _budget(max_memory):
             if heavy:
                 load()
             if plugin:
@@ -191,13 +218,17 @@ def with_common_options(command: Callable[..., int], *, heavy: bool = True) -> C
 
                 for file in plugin:
                     load_plugin(file)
-            return command(*args, **options)
+            now.exit_code = command(*args, **options)
+            return now.exit_code
 
-    more = {"plugin": Plugins, "max_memory": MaxMemory}
+    more = {"plugin": Plugins, "max_memory": MaxMemory, "quiet": Quiet, "as_json": Json}
+    defaults = {"quiet": False, "as_json": False}
     signature = inspect.signature(command)
     last = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-        for name, kind in more.items()
+        inspect.Parameter(
+            key, inspect.Parameter.KEYWORD_ONLY, default=defaults.get(key), annotation=kind
+        )
+        for key, kind in more.items()
     ]
     parameters = [*signature.parameters.values(), *last]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]

@@ -1,13 +1,12 @@
 """Commands on results: inspect, ask, verify, export, evaluate, plot, report."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from neuroslam.cli.options import Axes, Landmarks, MapFile, RunFolder, Truth
-from neuroslam.cli.output import USER_ERROR, complain, say
+from neuroslam.cli.output import USER_ERROR, complain, report, say, summarise
 from neuroslam.cli.tables import Table, new_table
 from neuroslam.errors import RunError, counted, printable
 
@@ -25,14 +24,19 @@ def inspect_command(
     ] = None,
 ) -> int:
     """List the content of a map and its sessions."""
-    from neuroslam.runs.inspect import inspect, write_tables
+    from neuroslam.runs.inspect import figures_of, inspect, write_tables
 
     table = new_table("quantity", "value", title=str(path), headed=False)
-    for name, value in inspect(path):
+    rows = inspect(path)
+    for name, value in rows:
         table.add_row(name, value)
     say(table)
+    if report().as_json:  # reads the brain a second time
+        summarise(path=path, **figures_of(path))
     if tables is not None:
-        say(f"Written: {counted(len(write_tables(path, tables)), 'table')} in {tables}")
+        files = write_tables(path, tables)
+        summarise(written=files)
+        say(f"Written: {counted(len(files), 'table')} in {tables}")
     return 0
 
 
@@ -52,7 +56,6 @@ def ask_command(
     to: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE.png", help="Picture to write.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
     landmarks: Landmarks = None,
     within: Annotated[
         float | None,
@@ -70,9 +73,7 @@ def ask_command(
     answer = asked.ask(question, within)
     if to is not None:
         save(asked.draw(answer), to)
-    if as_json:
-        print(json.dumps(answer.to_dict(), allow_nan=False))
-        return 0
+    summarise(**answer.to_dict())
     if answer.found:
         extra = {"at": [f"distance ({asked.unit})"], "box": ["share in box"]}.get(
             answer.question.form, []
@@ -104,6 +105,7 @@ def verify_command(path: MapFile) -> int:
     from neuroslam.runs.verify import verify
 
     faults = verify(path)
+    summarise(path=path, sound=not faults, faults=faults)
     for fault in faults:
         complain("verify", fault)
     if not faults:
@@ -124,7 +126,9 @@ def export_command(
     """Export a map as TUM, g2o, GraphML, NIR or MCAP."""
     from neuroslam.runs.export import export
 
-    say(f"Written: {export(path, to, kind, source, lambda note: say(f'Left out: {note}'))}")
+    written = export(path, to, kind, source, lambda note: say(f"Left out: {note}"))
+    summarise(path=path, written=written)
+    say(f"Written: {written}")
     return 0
 
 
@@ -147,6 +151,10 @@ def plan_command(
 
     found = plan(path, goal, out, start)
     unit = found.unit
+    summarise(
+        path=path, experiences=found.path, length=found.length_m, duration_s=found.duration_s,
+        beside_goal=found.beside_m, unit=unit, written=found.files,
+    )  # fmt: skip
     beside = f", {found.beside_m:.2f} {unit} from {goal}" if found.beside_m else ""
     say(
         f"From experience {found.path[0]} to {found.path[-1]}{beside}: "
@@ -172,6 +180,11 @@ def why_command(
 
     picture = path / f"why_{frame}.png" if out is None else out
     found = why(path, frame, picture)
+    summarise(
+        path=path, frame=frame, action=found.action, closed=found.closed, verdict=found.verdict,
+        checks=[vars(check) for check in found.checks], template=found.candidate,
+        experience=found.experience, stored=found.stored, written=picture,
+    )  # fmt: skip
     say(f"Frame {frame}, action {found.action}. {found.verdict}")
     table = new_table("check", "value", "limit", "passed")
     for row in summary_rows(found):
@@ -227,7 +240,10 @@ def evaluate_command(
         table = Table(title=printable(f"{track} and the relations of {relations}"))
         for column in ("relations", "number", "position, mean (m)", "heading, mean (°)"):
             table.add_column(column, justify="left" if column == "relations" else "right")
-        for name, number, metres, degrees in evaluate_relations(track, relations):
+        compared = evaluate_relations(track, relations)
+        names = ("relations", "number", "position_mean_m", "heading_mean_deg")
+        summarise(track=track, relations=[dict(zip(names, row, strict=True)) for row in compared])
+        for name, number, metres, degrees in compared:
             table.add_row(name, str(number), f"{metres:.4f}", f"{degrees:.3f}")
         say(table)
         return 0
@@ -242,6 +258,9 @@ def evaluate_command(
         for column in ("alignment", "RMSE (m)", "of the diagonal (%)", "rotation (°)", "scale"):
             table.add_column(column, justify="left" if column == "alignment" else "right")
         rows, figure = compare_maps(track, against, to)
+        summarise(
+            track=track, against=against, alignments=[row._asdict() for row in rows], written=figure
+        )
         for row in rows:
             table.add_row(
                 row.mode,
@@ -263,6 +282,11 @@ def evaluate_command(
     errors = evaluate(track, truth, mode, notes.append, axes, track_axes)
     for name, found, unit in errors:
         table.add_row(name, *(f"{value:.4f}" for value in found[:4]), unit, str(found.n))
+    summarise(
+        track=track,
+        errors=[{"error": name, **found._asdict(), "unit": unit} for name, found, unit in errors],
+        notes=notes,
+    )
     say(table)
     for note in notes:
         say(note)
@@ -276,7 +300,9 @@ def plot_command(
     """Draw the map, the cells of the brain, and counts over time."""
     from neuroslam.runs.plot import plot
 
-    for path in plot(out, to or out):
+    written = plot(out, to or out)
+    summarise(path=out, written=written)
+    for path in written:
         say(str(path))
     return 0
 
@@ -301,5 +327,7 @@ def report_command(
     """Write one HTML page that explains a run, for any browser."""
     from neuroslam.report import write_report
 
-    say(f"Written: {write_report(out, to, pictures_mb=pictures, source=source)}")
+    written = write_report(out, to, pictures_mb=pictures, source=source)
+    summarise(path=out, written=written)
+    say(f"Written: {written}")
     return 0

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from neuroslam.cli.options import Assignments, ConfigFile, Offset, Out, Preset, Source, Stop
-from neuroslam.cli.output import say
+from neuroslam.cli.output import say, summarise
 from neuroslam.cli.progress import show_stages
 from neuroslam.cli.tables import new_table
 
@@ -48,6 +48,7 @@ def tune_command(
             overwrite=overwrite,
             on_stage=on_stage,
         )
+    summarise(source=source, out=out, **tuning.to_dict())
     for note in tuning.notes:
         say(note)
     table = new_table(
@@ -69,9 +70,12 @@ def presets_command() -> int:
     from neuroslam.config import preset_folder, preset_names
 
     table = new_table("preset", "purpose")
+    presets: dict[str, str] = {}
     for name in preset_names():
         lines = (preset_folder() / f"{name}.toml").read_text(encoding="utf-8").splitlines()
         about = takewhile(lambda line: line.startswith("#"), lines)
-        table.add_row(name, " ".join(line.lstrip("# ") for line in about))
+        presets[name] = " ".join(line.lstrip("# ") for line in about)
+        table.add_row(name, presets[name])
+    summarise(presets=presets)
     say(table)
     return 0

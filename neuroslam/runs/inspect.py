@@ -72,6 +72,44 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
     return rows
 
 
+def figures_of(path: str | Path) -> dict[str, Any]:
+    """Return the content of a brain as plain values: counts, extent, sessions and merges.
+
+    Args:
+        path: Brain file, or folder of a run.
+
+    Raises:
+        CheckpointError: If the brain cannot be read.
+    """
+    file = brain_file(path)
+    brain = load_brain(file)
+    positions, links, log = brain.map.poses[:, :2], brain.map.links, brain.sessions
+    made = Counter(brain.map.origins().session.tolist())
+    return {
+        "file": file,
+        "bytes": file.stat().st_size,
+        "cells": list(brain.config.cells),
+        "unit": length_unit(file),
+        "templates": brain.view.n,
+        "experiences": brain.map.n,
+        "links": brain.map.n_links,
+        "loop_closures": int(closes_loop(links.source, links.target).sum()),
+        **gathered(brain.populations.values(), counts_of),
+        "extent": np.ptp(positions, axis=0).tolist() if len(positions) else [0.0, 0.0],
+        "length_of_links": float(links.distance_m.sum()),
+        "sessions": [vars(one) | {"experiences": made[one.id]} for one in log.sessions],
+        "merges": log.merges,
+        "refused_merges": log.refusals,
+        "stored_maps_not_joined": [
+            {
+                "sessions": [one.name for one in stored.sessions.sessions],
+                "experiences": stored.map.n,
+            }
+            for stored in brain.stored
+        ],
+    }
+
+
 def write_tables(path: str | Path, out: str | Path) -> list[Path]:
     """Write the state of a brain as CSV files that a person can read.
 

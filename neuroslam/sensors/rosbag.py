@@ -70,6 +70,7 @@ def open_bag(path: Path, topics: dict[str, str] | None = None, grey: GreyRule = 
     with _opened(path) as reader:
         msgtypes = {c.topic: c.msgtype for c in reader.connections}
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        span_s = reader.start_time * 1e-9, (reader.end_time - 1) * 1e-9  # the end is not in it
         found = {kind: candidates(reader, kind) for kind in KINDS}
         chosen = {
             kind: choose(path, kind, topics.get(kind), found[kind], msgtypes) for kind in KINDS
@@ -91,6 +92,9 @@ def open_bag(path: Path, topics: dict[str, str] | None = None, grey: GreyRule = 
     if (one := chosen["image"]) is not None:
         camera = BagCamera(path, one.topic, counts[one.topic], grey, one.scale)
         camera.choices = () if motion is not None else notes
+    for part_of in (camera, motion):
+        if part_of is not None:
+            part_of.span_s = span_s
     if camera is not None and motion is not None:
         return Streams(camera, motion)
     return cast(Source, camera or motion)  # one is there, as checked above
@@ -132,7 +136,13 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 class _BagTopic(Source):
-    """Messages of some topics, in order of time; each message of the first topic is a frame."""
+    """Messages of some topics, in order of time; each message of the first topic is a frame.
+
+    Attributes:
+        span_s: First and last time of reception in the whole bag; ``None``: unknown.
+    """
+
+    span_s: tuple[float, float] | None = None
 
     def __init__(self, path: Path, topics: tuple[str, ...], n_messages: int) -> None:
         self.path, self.topics = path, topics
