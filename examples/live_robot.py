@@ -16,16 +16,19 @@ from neuroslam.config import BrainConfig, build_config, merge_values, read_prese
 from neuroslam.geometry import compose, relative_poses
 from neuroslam.runs.live import Event, LiveRobot, Timing
 from neuroslam.types import Pose, Velocity
-from neuroslam.worlds.render import render
+from neuroslam.worlds.render import measure_ranges, render
 from neuroslam.worlds.world import WorldSource, open_world
 
 WORLD = "world:corridor?width=80&height=60&frames_per_lap=440&laps=3"
 RATE_HZ = 30.0
-LOOK_AHEAD_M = 0.35
+LOOK_AHEAD_M = 0.6
+RADIUS_M = 0.2
 
 
 class Robot:
     """A camera on wheels in a rendered world; the wheels measure 2 % too much, with noise.
+
+    Walls stop it: the wheels stall, and measure nothing.
 
     Args:
         world: Its world and the route that a person drives.
@@ -40,10 +43,14 @@ class Robot:
         """Drive for one period; return the picture and what the wheels measured."""
         way, turn = command.v_m_s / RATE_HZ, command.w_rad_s / RATE_HZ
         step = Pose(way * math.cos(0.5 * turn), way * math.sin(0.5 * turn), turn)
-        self.pose = compose(self.pose, step)
+        moved = compose(self.pose, step)
+        blocked = measure_ranges(self.world.world, moved, 24, 0.3).min() < RADIUS_M
+        if blocked:  # by a wall: the wheels stall, turning is free
+            way, moved = 0.0, self.pose._replace(theta_rad=moved.theta_rad)
+        self.pose = moved
         v, w = 1.02 + 0.02 * self._noise.standard_normal(2)
         picture = render(self.world.world, self.pose, self.world.camera)
-        return picture, (command.v_m_s * v, command.w_rad_s * w)
+        return picture, (way * RATE_HZ * v, command.w_rad_s * w)
 
     def by_hand(self, frame: int) -> Velocity:
         """Return the command that drives the robot to where the route is in a frame."""
@@ -69,7 +76,7 @@ def first_day(path: Path, on_event: object = print) -> Timing:
 
 
 def next_day(
-    path: Path, goals: int, start: int = 120, on_event: object = print
+    path: Path, goals: int, start: int = 120, on_event: object = print, pushed_m: float = 0.0
 ) -> tuple[int, int, Timing]:
     """Find the robot on the stored map, then drive to goals that the robot chooses.
 
@@ -78,6 +85,8 @@ def next_day(
         goals: Number of goals, experiences of the first day.
         start: Frame of the route where the robot wakes up; it does not know it.
         on_event: Called with each event.
+        pushed_m: How far a person pushes the robot to its left, and turns it by 0.3 rad, before
+            every second goal.
 
     Returns:
         Frames until it was found, goals that were reached, times of the steps.
@@ -99,11 +108,13 @@ def next_day(
     frames = found
     speed = math.hypot(*np.diff(world.truths()[:2, :2], axis=0)[0]) * RATE_HZ
     chosen, reached = np.random.default_rng(1), 0
-    for _ in range(goals):
+    for number in range(goals):
+        if number % 2 and pushed_m:
+            robot.pose = compose(robot.pose, Pose(0.0, pushed_m, 0.3))
         goal = int(chosen.choice(live.reachable()))
         true = world.truth(int(live.brain.map.experiences["first_frame"][goal]))
         live.add_goal(goal)
-        for _ in range(900):  # two laps
+        for _ in range(1500):  # two laps, and time to look around
             command = live.steer(speed, LOOK_AHEAD_M)
             if command is None:  # reached
                 break
@@ -125,9 +136,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("map", type=Path, help="file of the map")
     parser.add_argument("--goals", type=int, default=3)
+    parser.add_argument("--push", type=float, default=0.0, help="metres, before every second goal")
     words = parser.parse_args()
     print("first day:", first_day(words.map))
-    frames, reached, timing = next_day(words.map, words.goals)
+    frames, reached, timing = next_day(words.map, words.goals, pushed_m=words.push)
     print(f"next day: found after {frames} frames, {reached} of {words.goals} goals; {timing}")
 
 

@@ -10,14 +10,16 @@ from types import TracebackType
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
+import torch
 
 from neuroslam.brain import NavigationBrain, load_brain, save_brain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
-from neuroslam.geometry import rotate
-from neuroslam.mapping.planning import Plan, leads_to, on_loops
+from neuroslam.geometry import ORIGIN, relative
+from neuroslam.mapping.planning import Plan, leads_to, on_loops, quickest_path
+from neuroslam.runs.following import Following, PathFollower
 from neuroslam.sensors.frames import check_image
-from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Frame, Pose, StepResult, Velocity
+from neuroslam.types import NO_EXPERIENCE, Frame, Pose, StepResult, Velocity
 
 EventKind = Literal["loop_closed", "relocalised", "kidnapped", "joined", "goal_reached"]
 """A link to an experience made earlier; a lost robot found; a robot moved by hand; a stored map
@@ -28,7 +30,9 @@ Order = Literal["rgb", "bgr", "grey"]
 
 _EARLIER = 20  # experiences since the one that closes a loop
 _KNOWN_LINKS = 20.0  # links of odometry alone after which the confidence is 1 / e
-_ALIKE = 1.5  # match error, in thresholds, up to which a view shows the heading
+_LONG_LINK = (
+    4.0  # links as long as that many usual ones are followed only if there is no other path
+)
 _TURN_LINKS = 6.0  # links that facing to the left or right counts as
 _TIMES = 1000  # steps in the figures of time
 
@@ -118,6 +122,8 @@ class LiveRobot:
         if stored is not None:
             self.brain.store(stored)
         self.located: Located | None = None
+        self._follower = PathFollower(self.brain)
+        self._goal = NO_EXPERIENCE  # of the path that is followed
         self._lock = threading.RLock()
         self._frames = 0
         self._times_ms: deque[float] = deque(maxlen=_TIMES)
@@ -151,9 +157,14 @@ class LiveRobot:
         motion = None if velocity is None else Velocity(*map(float, velocity))
         with self._lock:
             began_s = time.perf_counter()
-            before = self._known()
+            before, goals = self._known(), self.brain.map.goals
+            waiting = {name: goals[name].clone() for name in goals.columns}
             result = self.brain(Frame(self._frames, time_s, picture, motion, ranges))
             self._frames += 1
+            if before[4] > self.brain.map.n or before[1] < len(self.brain.sessions.merges):
+                self._follower.reset()  # experiences have other ids
+            self._follower.moved(result.motion)
+            self._settle_goal(waiting)
             self.located = Located(result.pose, self._confidence(result), result)
             self._times_ms.append(1e3 * (time.perf_counter() - began_s))
             events = [
@@ -166,13 +177,35 @@ class LiveRobot:
                 self.on_event(event)
         return located
 
-    def _known(self) -> tuple[int, int, int, int]:
-        """Count sessions of the map, merges, goals, links."""
-        sessions, map_ = self.brain.sessions, self.brain.map
-        return len(sessions.sessions), len(sessions.merges), map_.goals.n, map_.n_links
+    def _settle_goal(self, waiting: dict[str, torch.Tensor]) -> None:
+        """Drop the goal at the end of the path; keep it while the views show the robot elsewhere.
 
-    def _events(self, before: tuple[int, int, int, int], result: StepResult) -> list[EventKind]:
-        sessions, merges, goals, links = self._known()
+        Args:
+            waiting: Goals before this frame.
+        """
+        follower, map_, goals = self._follower, self.brain.map, self.brain.map.goals
+        if not follower.path or not len(waiting["experience"]):
+            return
+        if int(waiting["experience"][0]) != follower.path[-1]:
+            return
+        dropped = goals.n < len(waiting["experience"])
+        if dropped and follower.elsewhere() and float(waiting["until_s"][0]) > map_.state.time_s:
+            goals.replace(**waiting)
+        elif dropped:
+            self._goal = NO_EXPERIENCE
+        elif follower.arrived():
+            goals.replace(**{name: goals[name][1:] for name in goals.columns})
+            self._goal = NO_EXPERIENCE
+
+    def _known(self) -> tuple[int, int, int, int, int]:
+        """Count sessions of the map, merges, goals, links, experiences."""
+        sessions, map_ = self.brain.sessions, self.brain.map
+        return len(sessions.sessions), len(sessions.merges), map_.goals.n, map_.n_links, map_.n
+
+    def _events(
+        self, before: tuple[int, int, int, int, int], result: StepResult
+    ) -> list[EventKind]:
+        sessions, merges, goals, links, _ = self._known()
         found: list[EventKind] = []
         joined = merges > before[1]
         kidnapped = sessions > before[0] and self.brain.sessions.now.began == "kidnapped"
@@ -232,10 +265,20 @@ class LiveRobot:
             self.brain.map.add_goal(experience, timeout_s)
 
     def reachable(self) -> list[int]:
-        """Return the experiences that can be driven to from one another, along driven links."""
+        """Return the experiences that can be driven to from one another, along driven links.
+
+        Links much longer than the others do not count if half of these experiences remain: what
+        lies between is not known.
+        """
         with self._lock:
             map_ = self.brain.map
-            return on_loops(map_.links, map_.n).tolist() if map_.n else []
+            if not map_.n:
+                return []
+            links = map_.links
+            short = links.distance_m <= _LONG_LINK * np.median(links.distance_m)
+            sound = on_loops(tuple(column[short] for column in links), map_.n).tolist()
+            every = on_loops(links, map_.n).tolist()
+            return sound if 2 * len(sound) >= len(every) else every
 
     def plan(self, forward: bool = True) -> Plan:
         """Return the path to the first goal; empty without one.
@@ -277,12 +320,15 @@ class LiveRobot:
 
         .. math:: \omega = 2 v \sin(\beta) / d
 
-        with the distance :math:`d` and the bearing :math:`\beta` of the experience ahead; a robot
-        that faces away from it turns first (R. Coulter, CMU-RI-TR-92-01, 1992).
+        with the distance :math:`d` and the bearing :math:`\beta` of the point of the path ahead; a
+        robot that faces away from it turns first (R. Coulter, CMU-RI-TR-92-01, 1992). The robot
+        knows its place on the path by odometry and by the views along it; where it recognises none
+        it slows down, and then turns once on the spot to find itself. Where it does not move
+        although it should, it backs first. See :mod:`neuroslam.runs.following`.
 
         Args:
             speed_m_s: Speed on a straight path.
-            look_ahead_m: Distance along the plan of the experience that is steered for.
+            look_ahead_m: Distance along the path of the point that is steered for.
             forward: As for :meth:`plan`.
             largest_turn_rad_s: Limit of the turn rate.
 
@@ -290,53 +336,60 @@ class LiveRobot:
             The command; ``None`` without a path to a goal.
         """
         with self._lock:
-            path = self.plan(forward).path
-            if not path:
+            follower, goals = self._follower, self.brain.map.goals["experience"].tolist()
+            if follower.brain is not self.brain:  # another was set
+                follower = self._follower = PathFollower(self.brain)
+            if not goals:
+                self._goal = NO_EXPERIENCE
                 return None
-            here, points = self.brain.map.pose, self.brain.map.poses[path, :2]
-            along = np.hypot(*np.diff(points, axis=0).T).cumsum()
-            at = min(int(np.searchsorted(along, look_ahead_m)) + 1, len(path) - 1)
-            dx, dy = (points[at] - (here.x_m, here.y_m)).tolist()
-            heading_rad = self._heading_by_view()
-        ahead, left = rotate(dx, dy, -heading_rad)
-        bearing, apart_m = math.atan2(left, ahead), max(math.hypot(dx, dy), 0.25 * look_ahead_m)
-        speed = speed_m_s * max(math.cos(bearing), 0.1)
-        turn = 2.0 * speed_m_s * math.sin(bearing) / apart_m
-        if abs(bearing) > 0.5 * math.pi:
-            turn = math.copysign(largest_turn_rad_s, bearing)
-        limit = largest_turn_rad_s
-        return Velocity(speed, min(max(turn, -limit), limit))
+            found = follower.found()
+            if found is not None:
+                self._take_path(found, ORIGIN, goals[0], forward)
+            elif self._goal != goals[0] or not follower.path:
+                known, pose = self.brain.map.current, self.brain.map.pose
+                if follower.sure:
+                    start, offset = follower.offset()
+                else:
+                    if not leads_to(self.brain.map.links, self.brain.map.n, goals[0])[known]:
+                        known = self._beside(goals[0]) if forward else known
+                    start = known
+                    offset = relative(Pose(*self.brain.map.poses[known].tolist()), pose)
+                self._take_path(start, offset, goals[0], forward)
+            if not follower.path:
+                return None
+            return follower.command(speed_m_s, look_ahead_m, largest_turn_rad_s)
 
-    def _heading_by_view(self) -> float:
-        """Return the heading on the map by the shift of the view against that of the experience.
+    def _take_path(self, start: int, offset: Pose, goal: int, forward: bool) -> None:
+        """Follow the plan from an experience, relative to which the robot has a pose."""
+        self._goal = goal
+        path = self._path(start, goal, forward)
+        if path:
+            self._follower.take_path(path, offset)
+        else:
+            self._follower.reset()
 
-        A map of a forward camera knows the heading only as far as a view is recognised; how far the
-        robot is turned from the path shows in the columns (A. Zhang, L. Kleeman, IJRR 28, 2009).
+    def _path(self, start: int, goal: int, forward: bool) -> list[int]:
+        """Plan without links that failed, and if possible without long ones.
+
+        Between the ends of a long link the robot may have driven a bend along other experiences.
         """
-        map_, view = self.brain.map, self.brain.config.view
-        pose, here = map_.pose, map_.current
-        template = int(map_.experiences.array("template")[here])
-        if view.panoramic or template == NO_TEMPLATE or self.brain.continuity.state.frames == 0:
-            return pose.theta_rad
-        shape = (view.template_width, view.template_height)
-        now = self.brain.continuity.before.numpy().reshape(shape).astype(np.int64)
-        then = self.brain.view.templates.array("pixels")[template].reshape(shape).astype(np.int64)
-        most = view.template_width // 3
-        shifts = np.arange(-most, most + 1)
-        width = view.template_width
-        apart = np.array(
-            [
-                np.abs(
-                    now[max(s, 0) : width + min(s, 0)] - then[max(-s, 0) : width - max(s, 0)]
-                ).mean()
-                for s in shifts
-            ]
-        )
-        best = int(apart.argmin())
-        if apart[best] > 255.0 * _ALIKE * view.threshold:
-            return pose.theta_rad
-        columns_per_rad = width / math.radians(self.brain.config.odometry.fov_deg)
-        return float(map_.poses[here, 2] + shifts[best] / columns_per_rad)
+        links, n = self.brain.map.links, self.brain.map.n
+        failed = self._follower.failed
+        sound = [pair not in failed for pair in zip(*(c.tolist() for c in links[:2]), strict=True)]
+        tried = np.array(sound, dtype=bool)
+        longest = _LONG_LINK * float(np.median(links.distance_m)) if len(sound) else 0.0
+        for kept in (tried & (links.distance_m <= longest), tried, np.ones_like(tried)):
+            some = tuple(column[kept] for column in links)
+            path = quickest_path(some, n, start, goal, forward).path
+            if path:
+                return path
+        return []
+
+    @property
+    def following(self) -> Following:
+        """How the robot follows its path."""
+        with self._lock:
+            return self._follower.now
 
     def save(self) -> None:
         """Write the brain to its file, atomically.

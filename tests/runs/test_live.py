@@ -12,6 +12,7 @@ from neuroslam.brain import load_brain
 from neuroslam.config import build_config
 from neuroslam.errors import BadFrame
 from neuroslam.mapping.planning import leads_to, on_loops, quickest_path
+from neuroslam.runs.following import PathFollower
 from neuroslam.runs.live import LiveRobot, as_picture
 from neuroslam.types import Velocity
 
@@ -48,9 +49,9 @@ def test_the_example_maps_wakes_up_and_reaches_its_goals(example, tmp_path, caps
     example.WORLD = "world:corridor?width=80&height=60&frames_per_lap=300&laps=1.7"
     example.first_day(path, events.append)
     assert "loop_closed" in [event.kind for event in events]
-    frames, reached, timing = example.next_day(path, goals=1, start=60)
+    frames, reached, timing = example.next_day(path, goals=2, start=60, pushed_m=0.4)
     assert frames < 150
-    assert reached == 1
+    assert reached == 2  # it finds back to the path after the push
     assert timing.steps > 30
     assert "goal_reached" in capsys.readouterr().out
 
@@ -117,6 +118,38 @@ def test_a_robot_without_a_goal_gets_no_command_and_with_one_steers_for_it(mappe
     command = robot.steer(0.5, 0.5)
     assert isinstance(command, Velocity)
     assert 0.0 < command.v_m_s <= 0.5
+
+
+def test_a_goal_stays_while_the_views_show_the_robot_elsewhere(mapped):
+    robot = LiveRobot(path=mapped[0])
+    robot.brain = load_brain(mapped[0])
+    robot._follower = PathFollower(robot.brain)
+    goal = robot.brain.map.n - 1
+    robot.brain.map.relocalise(2)
+    robot.add_goal(goal)
+    waiting = {name: robot.brain.map.goals[name].clone() for name in robot.brain.map.goals.columns}
+    assert robot.steer(0.5, 0.5) is not None
+    robot.brain.map.goals.replace(**{name: rows[:0] for name, rows in waiting.items()})
+    robot._settle_goal(waiting)
+    assert robot.brain.map.goals["experience"].tolist() == [goal]
+    robot._follower.at = len(robot._follower.path) - 2  # beside the goal: the map is believed
+    robot.brain.map.goals.replace(**{name: rows[:0] for name, rows in waiting.items()})
+    robot._settle_goal(waiting)
+    assert robot.brain.map.goals.n == 0
+
+
+def test_a_link_after_which_the_robot_was_lost_is_avoided(mapped):
+    robot = LiveRobot(path=mapped[0])
+    robot.brain = load_brain(mapped[0])
+    robot._follower = PathFollower(robot.brain)
+    links = robot.brain.map.links_table
+    slow = {"distance_m": 0.7, "heading_rad": 0.0, "facing_rad": 0.0, "duration_s": 60.0}
+    links.append(source=3, target=5, **slow)
+    assert robot._path(2, 6, forward=True) == [2, 3, 4, 5, 6]
+    robot._follower.failed.add((3, 4))
+    assert robot._path(2, 6, forward=True) == [2, 3, 5, 6]
+    robot._follower.failed.add((3, 5))
+    assert robot._path(2, 6, forward=True) == [2, 3, 4, 5, 6]  # there is no other
 
 
 def test_pictures_of_opencv_and_grey_ones_are_taken():
