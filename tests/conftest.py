@@ -1,7 +1,6 @@
 """Fixtures that several test files share."""
 
 import gc
-import multiprocessing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,19 +47,6 @@ def cases(shared) -> Path:
     if not folder.is_dir():
         pytest.skip("no ../shared/cases beside the checkout")
     return folder
-
-
-@pytest.fixture
-def forked(monkeypatch):
-    """Fork the processes of ``--jobs`` from one that has loaded torch, which each else loads anew.
-
-    That they can start from nothing, as they do elsewhere, is for ``test_parallel.py``.
-    """
-    if "forkserver" in multiprocessing.get_all_start_methods():
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["neuroslam.runs.sweep", "neuroslam.runs.fleet"])
-        starts = SimpleNamespace(get_context=lambda _how: context)
-        monkeypatch.setattr("neuroslam.runs.parallel.multiprocessing", starts)
 
 
 @pytest.fixture

@@ -165,7 +165,6 @@ def write_bag(path, frames):
                 writer.write(connections[topic], seconds * 10**9 + nanoseconds, data)
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda p: p.name)
 def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -192,7 +191,6 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
         assert code == 0, f"{line}\n{told.err}{told.out}"
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("name", ["sweeps.md", "tuning.md", "features.md"])
 def test_the_programs_of_a_page_run_as_printed(name, inputs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -18,7 +18,7 @@ from neuroslam.state.tables import Scalars
 ROOT = Path(__file__).resolve().parents[1] / "neuroslam"
 
 PLAN = [line.split() for line in """
-    types errors geometry compiled threads interrupts limits
+    types errors geometry compiled threads interrupts limits workers
     config
     state
     sensors worlds

@@ -28,6 +28,7 @@ from neuroslam.cli.progress import show_runs
 from neuroslam.cli.tables import across, down
 from neuroslam.errors import ConfigError, counted
 from neuroslam.experiments import EXPERIMENTS
+from neuroslam.workers import prepare_workers
 
 
 def sweep_command(
@@ -56,6 +57,7 @@ def sweep_command(
     overwrite: Overwrite = False,
 ) -> int:
     """Map sources with all combinations of values; exit 2 if a run failed."""
+    prepare_workers(jobs, ray)
     from neuroslam.runs.sweep import counted_by_cells, sweep, varied
 
     so_far = (0, 0)
@@ -128,6 +130,7 @@ def fleet_command(
     overwrite: Overwrite = False,
 ) -> int:
     """Map each SOURCE as one session, merge all; exit 3: some stay apart, 2: one failed."""
+    prepare_workers(jobs, ray)
     from neuroslam.runs.fleet import fleet
     from neuroslam.runs.run import resolve_config
 
@@ -211,6 +214,7 @@ def experiment_command(
     ] = False,
 ) -> int:
     """Reproduce an experiment of a paper, or all of them with one page that compares them."""
+    prepare_workers(jobs, ray)
     from neuroslam.experiments import run_all, run_experiment
 
     if name == "all":

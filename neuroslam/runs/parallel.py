@@ -4,10 +4,8 @@ Each call runs with one thread of torch and OpenCV, so results are equal whereve
 """
 
 import contextlib
-import multiprocessing
 import os
 import pickle
-import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -22,6 +20,7 @@ from neuroslam.errors import NeuroslamError, RunError
 from neuroslam.interrupts import end_runs
 from neuroslam.limits import MAX_MEMORY
 from neuroslam.threads import limit_threads
+from neuroslam.workers import interrupts_deferred, start_worker, worker_context
 
 _RAY_CLUSTER = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Environment variable that, as ``0``, lets a Ray that is started here listen on the loopback
@@ -122,7 +121,7 @@ def _in_processes(
     lost: list[int] = []
     with _workers(min(jobs, len(numbered))) as pool:
         futures: dict[Future[R | NeuroslamError], int] = {}
-        with _interrupts_wait():
+        with interrupts_deferred():
             for number, item in numbered.items():
                 try:
                     futures[pool.submit(_attempt, function, item)] = number
@@ -145,9 +144,9 @@ def _in_processes(
 @contextlib.contextmanager
 def _workers(n: int) -> Iterator[ProcessPoolExecutor]:
     """Keep a pool of processes that end when this block is left early, or this process ends."""
-    context = multiprocessing.get_context("spawn")
+    context = worker_context()
     child_end, parent_end = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(n, context, _start_worker, (child_end,))
+    pool = ProcessPoolExecutor(n, context, _start_worker, (child_end, dict(os.environ)))
     try:
         yield pool
         pool.shutdown()
@@ -157,7 +156,7 @@ def _workers(n: int) -> Iterator[ProcessPoolExecutor]:
         child_end.close()
 
 
-def _start_worker(lifeline: Connection) -> None:
+def _start_worker(lifeline: Connection, environment: dict[str, str]) -> None:
     """Leave Ctrl-C to the parent; when it closes its end of the pipe, save the run and end."""
 
     def end_with_parent() -> None:
@@ -167,21 +166,8 @@ def _start_worker(lifeline: Connection) -> None:
             _idle.wait(_SAVING_S)
         os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    start_worker(environment)
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Defer Ctrl-C to the end of the block; processes started in it never receive it."""
-    if os.name != "posix":
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _died() -> RunError:

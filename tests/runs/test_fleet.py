@@ -97,7 +97,6 @@ def test_the_merged_map_lies_where_the_ring_is(done):
     assert "ate_merged_m" not in report.sessions[4]
 
 
-@pytest.mark.usefixtures("forked")
 def test_two_jobs_give_the_maps_of_one_job(done, tmp_path):
     out, report = done
     told = []

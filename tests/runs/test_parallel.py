@@ -11,20 +11,23 @@ import cv2
 import pytest
 import torch
 
+from neuroslam import workers
 from neuroslam.config import read_preset
 from neuroslam.errors import ConfigError, NeuroslamError, RunError
 from neuroslam.runs.parallel import outcomes, parallel_map
 from neuroslam.runs.sweep import parse_values
 
 
-@pytest.mark.usefixtures("forked")
 def test_results_come_in_the_order_of_the_items():
     assert parallel_map(math.sqrt, [9.0, 4.0, 1.0]) == [3.0, 2.0, 1.0]
     assert parallel_map(math.sqrt, [9.0, 4.0, 1.0], jobs=2) == [3.0, 2.0, 1.0]
     assert parallel_map(math.sqrt, [], jobs=2) == []
 
 
-def test_processes_are_others_and_have_one_thread():
+@pytest.mark.parametrize("start", ["spawn", workers.START_METHOD])
+def test_processes_are_others_and_have_one_thread(start, monkeypatch):
+    monkeypatch.setattr(workers, "START_METHOD", start)
+    monkeypatch.setenv("SET_LATER", "yes")
     (threads,) = parallel_map(eval, ["__import__('torch').get_num_threads()"])
     ours, *theirs = (parallel_map(eval, ["__import__('os').getpid()"] * 2, jobs=n) for n in (1, 2))
     assert threads == 1
@@ -32,6 +35,8 @@ def test_processes_are_others_and_have_one_thread():
     assert os.getpid() not in theirs[0]
     questions = ["__import__('torch').get_num_threads()", "__import__('cv2').getNumThreads()"]
     assert parallel_map(eval, questions, jobs=2) == [1, 1]
+    later = "__import__('os').environ['SET_LATER']"
+    assert parallel_map(eval, [later] * 2, jobs=2) == ["yes"] * 2
 
 
 def test_threads_are_as_they_were_afterwards():
@@ -45,7 +50,6 @@ def test_threads_are_as_they_were_afterwards():
     assert cv2.getNumThreads() == before[1]
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_a_users_stops_only_its_item(jobs):
     texts = ["a=1,2", "b", "c=3"]
@@ -57,14 +61,12 @@ def test_an_error_of_a_users_stops_only_its_item(jobs):
         parallel_map(read_preset, ["full", "none"], jobs)
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_bug_is_raised_as_it_is(jobs):
     with pytest.raises(ValueError, match=r"math domain error|nonnegative"):
         parallel_map(math.sqrt, [4.0, -1.0], jobs)
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_process_that_dies_takes_no_other_item_with_it():
     lines = ["1", "__import__('os')._exit(9)", "3"]
     found = dict(outcomes(eval, lines, jobs=2))

@@ -221,7 +221,6 @@ def test_a_local_ray_of_two_workers_gives_the_files_of_one_after_the_other(seria
 # --- what goes wrong ----------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_failed_run_is_reported_in_one_line_and_stops_no_other(tmp_path, call):
     out = tmp_path / "out"
     done = call("sweep", tmp_path / "nowhere.avi", WORLD, "-o", out, "--stop", "20", "--jobs", "2")
