@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench bench-check faults lint format notebooks clean
+.PHONY: demo test bench bench-check faults lint format notebooks docs dist dist-check clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -42,5 +42,28 @@ format: $(VENV)/.installed
 notebooks: $(VENV)/.installed
 	$(BIN)/jupytext --update --to notebook notebooks/*.py
 
+# The site: build/site/html/index.html. No network at build; warnings are errors.
+docs: $(VENV)/.docs
+	$(BIN)/python docs/site/build.py
+
+# Wheel and sdist of the last commit, from a clean clone.
+dist: $(VENV)/.release
+	rm -rf build/clone dist
+	git clone --quiet . build/clone
+	$(BIN)/python -m build --outdir dist build/clone
+	$(BIN)/twine check --strict dist/*
+
+# The wheel alone, in a fresh virtual environment: demo, run, report.
+dist-check: dist
+	rm -rf build/fresh
+	$(PYTHON) -m venv build/fresh
+	build/fresh/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/fresh && bin/neuroslam demo --out demo
+	cd build/fresh && bin/neuroslam run world:corridor -o first && bin/neuroslam report first
+
+$(VENV)/.docs $(VENV)/.release: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(patsubst .%,%,$(notdir $@))]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo out .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo out .pytest_cache .ruff_cache .hypothesis

@@ -99,7 +99,7 @@ class NavigationBrain(BrainState):
                 a gap, the second frame is accepted.
             MapError: If the robot would leave the space of a population; the state is unchanged.
             RuntimeError: If a population refuses a frame elsewhere than in ``observe`` or
-                ``check``; or if an error interrupted an earlier frame, see :attr:`half_taken`.
+                ``check``; or if an error interrupted an earlier frame, see ``half_taken``.
         """
         if self.half_taken:
             raise RuntimeError(self.half_taken)

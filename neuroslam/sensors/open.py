@@ -57,28 +57,28 @@ def open_source(
 ) -> Source:
     """Open the source that ``spec`` names.
 
-    ==================================  ========================================================
-    ``drive.avi``, ``.mp4``, ``.mkv``   video
-    ``frames/``, ``frames.tar``,        images, with times and motion if there are any
-    ``frames.tar.gz``                   (:mod:`neuroslam.sensors.images`)
-    ``list.txt``, ``list.csv``          image list (:mod:`neuroslam.sensors.images`)
-    ``motion.csv``                      speed and turn rate (:mod:`neuroslam.sensors.tracks`)
-    ``path.npz``, ``path.npy``          positions (:mod:`neuroslam.sensors.tracks`)
-    ``rat.npz`` with an arena in it     positions and walls (:mod:`neuroslam.worlds.rodent`)
-    TUM, KITTI, EuRoC, TUM-VI folder    images and truth (:mod:`neuroslam.sensors.datasets`)
-    ``log.clf``, ``.log``, ``.bz2``     scans of a CARMEN log (:mod:`neuroslam.sensors.carmen`)
-    MRCLAM folder, ``?robot=2``         odometry and landmarks (:mod:`neuroslam.sensors.mrclam`)
-    tub of donkeycar                    images, times, controls (:mod:`neuroslam.sensors.tub`)
-    ``drive.bag``, ``.mcap``, ``.db3``  a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
-    ``camera:0``, ``camera:rtsp://...`` a live camera (:mod:`neuroslam.sensors.camera`)
-    ``world:NAME``                      rendered world (:mod:`neuroslam.worlds.world`)
-    ``track:rat.csv?units=cm,deg``      track of an animal (:mod:`neuroslam.worlds.animal_tracks`)
-    ``arena:NAME``, ``arena:rat.npz``   walk with noisy senses (:mod:`neuroslam.worlds.senses`)
-    ``drive.avi+motion.csv``            two sources merged by time: a camera and motion
-                                        (:mod:`neuroslam.sensors.streams`); with ``?offset=S``, S
-                                        seconds are added to the times of the motion
-    ``motion.csv+sightings.csv``        motion and landmarks (:mod:`neuroslam.sensors.sightings`)
-    ==================================  ========================================================
+    ===================================  ========================================================
+    ``drive.avi``, ``.mp4``, ``.mkv``    video
+    ``frames/``, ``frames.tar``,         images, with times and motion if there are any
+    ``frames.tar.gz``                    (:mod:`neuroslam.sensors.images`)
+    ``list.txt``, ``list.csv``           image list (:mod:`neuroslam.sensors.images`)
+    ``motion.csv``                       speed and turn rate (:mod:`neuroslam.sensors.tracks`)
+    ``path.npz``, ``path.npy``           positions (:mod:`neuroslam.sensors.tracks`)
+    ``rat.npz`` with an arena in it      positions and walls (:mod:`neuroslam.worlds.rodent`)
+    TUM, KITTI, EuRoC, TUM-VI folder     images and truth (:mod:`neuroslam.sensors.datasets`)
+    ``log.clf``, ``.log``, ``.bz2``      scans of a CARMEN log (:mod:`neuroslam.sensors.carmen`)
+    MRCLAM folder, ``?robot=2``          odometry and landmarks (:mod:`neuroslam.sensors.mrclam`)
+    tub of donkeycar                     images, times, controls (:mod:`neuroslam.sensors.tub`)
+    ``drive.bag``, ``.mcap``, ``.db3``   a ROS 1 or 2 bag (:mod:`neuroslam.sensors.rosbag`)
+    ``camera:0``, ``camera:rtsp://...``  a live camera (:mod:`neuroslam.sensors.camera`)
+    ``world:NAME``                       rendered world (:mod:`neuroslam.worlds.world`)
+    ``track:rat.csv?units=cm,deg``       track of an animal (:mod:`neuroslam.worlds.animal_tracks`)
+    ``arena:NAME``, ``arena:rat.npz``    walk with noisy senses (:mod:`neuroslam.worlds.senses`)
+    ``drive.avi+motion.csv``             two sources merged by time: a camera and motion
+                                         (:mod:`neuroslam.sensors.streams`); with ``?offset=S``, S
+                                         seconds are added to the times of the motion
+    ``motion.csv+sightings.csv``         motion and landmarks (:mod:`neuroslam.sensors.sightings`)
+    ===================================  ========================================================
 
     Args:
         spec: A path, or ``kind:name``.
