@@ -83,6 +83,15 @@ def notebook(text: str) -> str:
 WRITTEN: set[Path] = set()
 
 
+def with_further_pages(index: str) -> str:
+    """Return the text of the front page with the pages that its navigation does not name yet."""
+    pages = [path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md")]
+    names = [path.with_suffix("").as_posix() for path in pages if path.parts[0] != "site"]
+    new = [name for name in sorted(names) if f"\n{name}\n" not in index]
+    empty = "```{toctree}\n:caption: Further pages\n:hidden:\nFURTHER\n```\n\n"
+    return index.replace("FURTHER", "\n".join(new)) if new else index.replace(empty, "")
+
+
 def write(page: Path, content: bytes) -> None:
     """Write a file unless it is there: Sphinx builds only what is newer than its last build."""
     file = SOURCE / page
@@ -101,6 +110,8 @@ def lay_out_pages() -> None:
         text = file.read_text(encoding="utf-8")
         if file.suffix == ".py":
             text = notebook(text)
+        if file == HERE / "index.md":
+            text = with_further_pages(text)
         write(page, with_links_of_the_site(text, file, page).encode())
     for picture in sorted((ROOT / "docs" / "img").glob("*.png")):
         write(Path("img") / picture.name, picture.read_bytes())

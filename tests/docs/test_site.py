@@ -23,8 +23,9 @@ def build(tmp_path, monkeypatch):
     return module
 
 
-def test_every_page_is_in_the_navigation_once():
-    index = (SITE / "index.md").read_text("utf-8")
+def test_every_page_is_in_the_navigation_once(build):
+    index = build.with_further_pages((SITE / "index.md").read_text("utf-8"))
+    assert "FURTHER" not in index
     listed = re.findall(r"^(?:API <)?([\w/]+)>?$", index, re.MULTILINE)
     pages = {
         path.relative_to(ROOT / "docs").with_suffix("").as_posix()
@@ -33,6 +34,12 @@ def test_every_page_is_in_the_navigation_once():
     }
     tops = {"readme", "changelog", "contributing", "security"}
     assert sorted(listed) == sorted(pages | tops | {"api/neuroslam"})
+
+
+def test_a_page_that_the_navigation_does_not_name_is_added(build):
+    index = (SITE / "index.md").read_text("utf-8").replace("\nmemory\n", "\n")
+    further = build.with_further_pages(index).partition("Further pages\n:hidden:\n")[2]
+    assert further.startswith("memory\n```")
 
 
 def test_links_of_pages_lead_to_pages_of_the_site(build, tmp_path):
