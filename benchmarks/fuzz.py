@@ -3,8 +3,8 @@
 Each input is read in a process of its own, under a limit of time and of memory. A reader may read
 it, or refuse it in one line; anything else is a fault: a traceback, a hang, a crash, more memory
 than the limit. Crafted brains have a valid digest; one that ``verify`` calls sound must do in every
-command. Seeds are fixed. ``--keep DIR`` keeps the inputs that found faults; ``--only NAME`` takes
-the kinds whose name contains NAME.
+command. Seeds are fixed. ``--keep DIR`` keeps the inputs that found faults; ``--only NAME,NAME``
+takes the kinds whose name contains one of them.
 """
 
 import argparse
@@ -35,6 +35,8 @@ SECONDS = 20
 """Limit of processor time for an input; ten times it on the clock, for a machine may be shared."""
 MEGABYTES = 1024
 """Limit of memory for an input, beyond what the program itself takes."""
+RUN_KIND = "run: "
+"""Begin of the names of the kinds that are files of a run."""
 READ, REFUSED, FAULTS = "read", "refused", ("traceback", "hang", "crash", "memory")
 _READ, _REFUSED, _TRACEBACK = 0, 2, 1
 _BASE_MB = [0]
@@ -106,8 +108,12 @@ def note_base() -> None:
 def damaged_inputs(folder: Path, keep: Path | None, n: int, only: str) -> dict[str, Counter[str]]:
     """Damage the inputs of all readers, in turn."""
     (folder / "sound").mkdir()
-    kinds = [*targets(folder / "sound"), *run_folder(folder)]
-    kinds = [kind for kind in kinds if only in kind.name]
+    words = only.split(",")
+    kinds = targets(folder / "sound")
+    if any(word in RUN_KIND or RUN_KIND in word for word in words):
+        kinds += run_folder(folder)
+    note_base()
+    kinds = [kind for kind in kinds if any(word in kind.name for word in words)]
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for kind in kinds:  # a sound input must be read
         found, _, _ = outcome(lambda kind=kind: kind.read(laid(folder, kind, {})), folder / "log")
@@ -141,7 +147,6 @@ def laid(folder: Path, kind: Target, changed: dict[str, bytes]) -> Path:
 def run_folder(folder: Path) -> list[Target]:
     """Return the files of a run as inputs of the commands that read a run."""
     out = sound_run(folder / "run")
-    note_base()
     files = {str(f.relative_to(out)): f.read_bytes() for f in out.rglob("*") if f.is_file()}
     files.pop("manifest.json", None)  # an attacker can remove its digests
     texts = (

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from neuroslam import ActivityLog, record
 from neuroslam.cli import main
 from neuroslam.config import BrainConfig, to_toml
 from neuroslam.evaluation.trajectory import read_tum
@@ -242,6 +243,8 @@ def targets(folder: Path) -> list[Target]:
             for name in ("v.avi", "v.mp4", "v.mkv")
         ),
         *bags(folder),
+        *robot_logs(),
+        *animal_tracks(folder),
     ]
 
 
@@ -335,6 +338,98 @@ def bags(folder: Path) -> list[Target]:
         file = path if first else next(path.glob(f"*{name[1:]}"))
         found.append(Target(f"bag {name[2:]}", {name: file.read_bytes()}, (name,), frames_of(name)))
     return found
+
+
+def robot_logs() -> list[Target]:
+    """Make logs of CARMEN, MRCLAM, landmark sightings, raw KITTI and TUM-VI."""
+    beams = " ".join(["2.0"] * 19)
+    carmen = "PARAM robot_frontlaser_offset 0.1 h 0\nODOM 0 0 0 0 0 0 0 h 0\n" + "".join(
+        f"FLASER 19 {beams} {0.1 * k} 0 0 {0.1 * k} 0 0 {0.1 * k} h {0.1 * k}\n" for k in range(N)
+    )
+    laser = "".join(
+        f"ROBOTLASER1 0 -1.57 3.14 0.174 30 0.01 0 19 {beams} 0 {0.1 * k} 0 0 {0.1 * k} 0 0"
+        f" 0 0 0 0 0 {0.1 * k} h {0.1 * k}\n"
+        for k in range(N)
+    )
+    mrclam = {
+        "Robot1_Odometry.dat": rows("", [(0.1 * k, 0.5, 0.1) for k in range(N)], " "),
+        "Robot1_Measurement.dat": rows("", [(0.1 * k, 72, 2.0, 0.5) for k in range(N)], " "),
+        "Robot1_Groundtruth.dat": rows("", [(0.1 * k, 0.1 * k, 0, 0) for k in range(N)], " "),
+        "Barcodes.dat": b"6 72\n1 5\n",
+    }
+    seen = rows("time_s,number,distance_m,bearing_rad", [(0.1 * k, 7, 2.0, 0.5) for k in range(N)])
+    motion = rows("time_s,v_m_s,w_rad_s", [(0.1 * k, 0.5, 0.1) for k in range(N)])
+    stamps = rows("", [(f"2011-09-26 13:02:{25 + 0.1 * k:.9f}",) for k in range(N)])
+    poses = {
+        f"oxts/data/{k:010d}.txt": f"{49 + 1e-6 * k} 8.4 112 0 0 0.5".encode() for k in range(N)
+    }
+    raw = {"image_02/timestamps.txt": stamps, "oxts/timestamps.txt": stamps, **poses}
+    raw |= {f"image_02/data/{k:010d}.png": encoded(".png", k) for k in range(N)}
+    vi = {f"mav0/cam0/data/{k}.jpg": encoded(".jpg", k) for k in range(N)}
+    vi["mav0/cam0/data.csv"] = rows("#t,f", [(10**18 + 10**8 * k, f"{k}.jpg") for k in range(N)])
+    vi["mav0/mocap0/data.csv"] = rows(
+        "#t,x,y,z,w,x,y,z", [(10**18 + 10**8 * k, 0.1 * k, 0, 0, 1, 0, 0, 0) for k in range(N)]
+    )
+    axes = "".join(f"  - [{', '.join(['0.5'] * 4)}]\n" for _ in range(4))
+    vi["dso/camchain.yaml"] = f"cam0:\n  T_cam_imu:\n{axes}".encode()
+    in_mav = ("mav0/cam0/data.csv", "mav0/mocap0/data.csv", "dso/camchain.yaml")
+    in_raw = ("image_02/timestamps.txt", "oxts/timestamps.txt", *list(poses)[:3])
+
+    def both(folder: Path) -> None:
+        for _ in open_source(f"{folder}/m.csv+{folder}/s.csv").frames(0, 3 * N, lambda _: None):
+            pass
+
+    return [
+        Target("CARMEN FLASER", {"a.clf": carmen.encode()}, ("a.clf",), frames_of("a.clf"), True),
+        Target(
+            "CARMEN ROBOTLASER1", {"a.log": laser.encode()}, ("a.log",), frames_of("a.log"), True
+        ),
+        Target(
+            "CARMEN gzip",
+            {"a.log.gz": gzip.compress(carmen.encode())},
+            ("a.log.gz",),
+            frames_of("a.log.gz"),
+        ),
+        Target("MRCLAM folder", mrclam, tuple(mrclam), frames_of(""), True),
+        Target("sightings CSV", {"m.csv": motion, "s.csv": seen}, ("s.csv",), both, True),
+        Target("raw KITTI folder", raw, in_raw, frames_of(""), True),
+        Target("TUM-VI folder", vi, in_mav, frames_of(""), True),
+    ]
+
+
+def animal_tracks(folder: Path) -> list[Target]:
+    """Make tracks of animals as CSV, NPZ and NWB, and a record of cells."""
+    turn = 0.1 * np.arange(N)
+    path = np.column_stack([np.cos(turn), np.sin(turn)])
+    header = "time_ms,x_cm,y_cm,hd_deg"
+    table = rows(header, [(100 * k, *(100 * path[k]), 5.0 * k) for k in range(N)])
+    arrays = {"pos": path, "t": turn, "hd": turn, "arena_radius": np.array(2.0)}
+    saved_arrays = io.BytesIO()
+    np.savez(saved_arrays, **arrays)
+    log = ActivityLog.from_arrays(turn, path, {"grid": np.ones((N, 3))}, turn)
+    nwb = {"a.nwb": log.to_nwb(folder / "a.nwb").read_bytes()}
+    record("arena:square?minutes=0.01", only=["grid"], out=folder / "activity.zarr")
+    zarr = {
+        str(f.relative_to(folder)): f.read_bytes()
+        for f in (folder / "activity.zarr").rglob("*") if f.is_file()
+    }  # fmt: skip
+    texts = tuple(name for name in zarr if name.endswith((".zarray", ".zattrs")))
+    blocks = tuple(name for name in zarr if name not in texts)
+
+    def track(name: str) -> Callable[[Path], None]:
+        def read(at: Path) -> None:
+            for _ in open_source(f"track:{at}/{name}").frames(0, 3 * N, lambda _fault: None):
+                pass
+
+        return read
+
+    return [
+        Target("track CSV", {"r.csv": table}, ("r.csv",), track("r.csv"), True),
+        Target("track npz", {"r.npz": saved_arrays.getvalue()}, ("r.npz",), track("r.npz")),
+        Target("track NWB", nwb, ("a.nwb",), track("a.nwb")),
+        Target("activity, texts", zarr, texts, ActivityLog.open, True),
+        Target("activity, blocks", zarr, (*texts, *blocks), ActivityLog.open),
+    ]
 
 
 def damage(data: bytes, is_text: bool, draw: np.random.Generator) -> bytes:

@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuroslam.errors import RunError
+from neuroslam.errors import CheckpointError, RunError, first_line
 from neuroslam.runs.saves import settle
+from neuroslam.state.activity import ACTIVITY
+from neuroslam.state.arrays import array_names, digest_of_rows, rows_of
 from neuroslam.state.files import stored_digest, write_atomically
 
 MANIFEST = "manifest.json"
@@ -41,13 +43,25 @@ def extent_of(path: Path, n_bytes: int | None = None) -> Extent:
     return Extent(n, digest.hexdigest())
 
 
-def write_manifest(staged: Path, rows: Mapping[str, Extent]) -> None:
+def activity_entry(folder: Path) -> dict[str, Any]:
+    """Return the number of samples in a record of the cells' activity, and their SHA-256.
+
+    Raises:
+        CheckpointError: If it is damaged.
+    """
+    rows = min((rows_of(folder, name) for name in array_names(folder)), default=0)
+    return {"rows": rows, "sha256": digest_of_rows(folder, rows)}
+
+
+def write_manifest(staged: Path, rows: Mapping[str, Extent], activity: Path | None = None) -> None:
     """List the files of a save.
 
     Args:
         staged: Folder that holds all other files of the save. Pictures are left out: they can be
             drawn again, and other versions of matplotlib draw them differently.
         rows: Files that grow by one row per frame, wherever they are: what the save has of them.
+        activity: Folder of the recorded activity of a run that has ended. While the run goes on it
+            has no entry, as all of it, which may be gigabytes, would be read at every save.
     """
     files: dict[str, dict[str, Any]] = {name: extent._asdict() for name, extent in rows.items()}
     for path in sorted(staged.iterdir()):
@@ -55,6 +69,8 @@ def write_manifest(staged: Path, rows: Mapping[str, Extent]) -> None:
             files[path.name] = {"sha256": stored_digest(path)}
         elif path.is_file() and path.suffix != ".png" and path.name not in rows:
             files[path.name] = extent_of(path)._asdict()
+    if activity is not None:
+        files[ACTIVITY] = activity_entry(activity)
     content = {"format": _FORMAT, "files": files}
     text = json.dumps(content | {"sha256": _digest(content)}, indent=2, sort_keys=True)
     write_atomically(staged / MANIFEST, lambda path: path.write_text(text, encoding="utf-8"))
@@ -141,10 +157,14 @@ def _fault(path: Path, entry: Mapping[str, Any]) -> str:
     try:
         if path.name == _BRAIN:
             same = stored_digest(path) in ("", entry["sha256"])  # "": loading says what is wrong
+        elif path.name == ACTIVITY:
+            same = digest_of_rows(path, int(entry["rows"])) == entry["sha256"]
         else:
             part = entry["bytes"] if path.name in ROWS else None
             same = extent_of(path, part)._asdict() == entry
-    except (OSError, KeyError, TypeError) as error:
+    except CheckpointError as error:
+        return first_line(error)
+    except (OSError, KeyError, TypeError, ValueError) as error:
         return f"cannot be read ({getattr(error, 'strerror', None) or error})"
     if same:
         return ""

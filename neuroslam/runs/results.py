@@ -106,6 +106,7 @@ class RunSaver:
     def __init__(self, folder: Folder, rows_in: Path) -> None:
         self.folder, self.rows_in = folder, rows_in
         self.rows: Callable[[], dict[str, Extent]] = self._measured_rows
+        self.ended = False  # the activity that was recorded will not grow
 
     def _measured_rows(self) -> dict[str, Extent]:
         return {name: extent_of(self.rows_in / name) for name in ROWS}
@@ -119,7 +120,8 @@ class RunSaver:
         write_text(staged / "config.toml", to_toml(brain.config) + plan.to_toml())
         write_text(staged / "metrics.json", json.dumps(summary.to_dict(), indent=2) + "\n")
         save_brain(brain, staged / "brain.safetensors")
-        write_manifest(staged, self.rows())
+        activity = self.rows_in / ACTIVITY
+        write_manifest(staged, self.rows(), activity if self.ended and activity.is_dir() else None)
         growing = ("events", ACTIVITY)
         stale = {*run_files(out), *growing}
         self.folder.commit(stale.difference((*ROWS, *growing) if self.rows_in == out else ()))
@@ -186,6 +188,7 @@ def write_results(
         write_text(staged / name, table)
     write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
     draw_map(brain, plan, trace, staged / "map.png", unit_of(summary.measured))
+    save.ended = True
     save(brain, plan, summary)
     return summary
 

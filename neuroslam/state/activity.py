@@ -51,6 +51,18 @@ class Spikes(NamedTuple):
         return times
 
 
+def _properties(stored: Any, name: str) -> dict[str, np.ndarray]:  # noqa: ANN401 - of JSON
+    """Return what cells are tuned to as columns of numbers, booleans or texts."""
+    try:
+        found = {str(key): np.array(values) for key, values in stored.items()}
+        wrong = [key for key, column in found.items() if column.dtype.kind not in "fiubU"]
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError(f"{name}: damaged ({error}); record it again") from None
+    if wrong:
+        raise CheckpointError(f"{name}: column {wrong[0]!r} is no column of numbers or texts")
+    return found
+
+
 class ActivityLog:
     """Activity of every population over time, with where the animal was; read into memory.
 
@@ -161,11 +173,28 @@ class ActivityLog:
             )
         rows = min(rows_of(path, name) for name in names)
         columns = {name: read_array(path, name, rows) for name in (*TIMES, *PATH)}
-        populations = [name for name in about["populations"] if name in names]
+        widths = {name: (1, dtype) for name, dtype in TIMES.items()} | PATH
+        for name, (width, dtype) in widths.items():
+            shape = (rows,) if width == 1 else (rows, width)
+            if columns[name].shape != shape or columns[name].dtype != np.dtype(dtype):
+                raise CheckpointError(
+                    f"{path}/{name}: {columns[name].dtype} {columns[name].shape}; expected "
+                    f"{np.dtype(dtype)} {shape}"
+                )
+        listed = about.get("populations")
+        if not isinstance(listed, list):
+            raise CheckpointError(f"{path}: does not list its populations; record it again")
+        populations = [name for name in listed if name in names]
         rates = {name: read_array(path, name, rows) for name in populations}
-        of_cells = {name: attributes_of(path, name) for name in populations}
-        units = {name: str(of_one.get("units", "1")) for name, of_one in of_cells.items()}
-        properties = {name: of_one.get("cells", {}) for name, of_one in of_cells.items()}
+        units, properties = {}, {}
+        for name, table in rates.items():
+            of_one = attributes_of(path, name)
+            if table.ndim != 2 or not np.isfinite(table).all():
+                raise CheckpointError(
+                    f"{path}/{name}: {table.shape}, or not finite; record it again"
+                )
+            units[name] = str(of_one.get("units", "1"))
+            properties[name] = _properties(of_one.get("cells", {}), f"{path}/{name}")
         return cls(columns, rates, units, properties, about)
 
     def __getitem__(self, name: str) -> np.ndarray:

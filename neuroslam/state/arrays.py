@@ -5,6 +5,7 @@ rows and columns; a block that is missing holds zeros. Rows are written into the
 shape counts them, so a process that is killed leaves whole rows, and no index to repair.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -15,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from neuroslam.errors import CheckpointError
-from neuroslam.limits import fits, too_much
+from neuroslam.limits import (
+    MOST_JSON_BYTES,
+    check_regular,
+    fits,
+    parse_json,
+    read_bounded,
+    too_much,
+)
 
 ROWS = 512
 """Rows of a block."""
@@ -137,8 +145,58 @@ def attributes_of(path: Path, name: str = "") -> dict[str, Any]:
 
 
 def rows_of(path: Path, name: str) -> int:
-    """Return the number of rows of an array."""
-    return int(_about(path, name)["shape"][0])
+    """Return the number of rows of an array.
+
+    Raises:
+        CheckpointError: If it does not say.
+    """
+    try:
+        rows = int(_about(path, name)["shape"][0])
+        if rows < 0:
+            raise ValueError(f"{rows} rows")
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError(f"{path}/{name}: damaged ({error}); record it again") from None
+    return rows
+
+
+def digest_of_rows(path: Path, rows: int) -> str:
+    """Return the SHA-256 of the first rows of all arrays in a folder.
+
+    It stays the same while rows, columns and arrays are added. Blocks are read one by one.
+
+    Raises:
+        CheckpointError: If an array is damaged.
+    """
+    digest = hashlib.sha256()
+    for name in array_names(path):
+        about = _about(path, name)
+        try:
+            chunks, dtype = [int(n) for n in about["chunks"]], np.dtype(about["dtype"])
+            row_bytes = math.prod(chunks[1:]) * dtype.itemsize
+            blocks = {_block_index(block.name, len(chunks)): Path(block.path)
+                      for block in os.scandir(path / name)}  # fmt: skip
+            for index in sorted(index for index in blocks if index is not None):
+                size = check_regular(blocks[index])
+                if size > chunks[0] * row_bytes:
+                    raise ValueError(f"block {blocks[index].name} has {size} bytes")
+                with blocks[index].open("rb") as file:
+                    data = file.read(
+                        max(0, min(chunks[0], rows - index[0] * chunks[0])) * row_bytes
+                    )
+                if any(data):
+                    digest.update(json.dumps([name, index, chunks, dtype.str]).encode())
+                    digest.update(data)
+        except (LookupError, TypeError, ValueError, OSError, SyntaxError) as error:
+            raise CheckpointError(f"{path}/{name}: damaged ({error}); record it again") from None
+    return digest.hexdigest()
+
+
+def _block_index(name: str, n_axes: int) -> tuple[int, ...] | None:
+    """Return the place of a block by the name of its file; ``None`` if it is no block."""
+    words = name.split(".")
+    if len(words) != n_axes or not all(w.isascii() and w.isdigit() and len(w) < 10 for w in words):
+        return None
+    return tuple(map(int, words))
 
 
 def read_array(path: Path, name: str, rows: int | None = None) -> np.ndarray:
@@ -158,16 +216,21 @@ def read_array(path: Path, name: str, rows: int | None = None) -> np.ndarray:
         needed = math.prod(shape) * dtype.itemsize
         if not fits(needed):
             raise CheckpointError(f"{path}/{name}: {too_much(needed)}")
-        whole = np.zeros(shape, dtype)
-        for index in np.ndindex(*(math.ceil(n / c) for n, c in zip(shape, chunks, strict=True))):
-            block = path / name / ".".join(map(str, index))
-            if not block.exists():
+        whole, block_bytes = np.zeros(shape, dtype), math.prod(chunks) * dtype.itemsize
+        for block in os.scandir(path / name):  # not all that there could be
+            index = _block_index(block.name, len(shape))
+            if index is None or any(
+                i * c >= n for i, c, n in zip(index, chunks, shape, strict=True)
+            ):
                 continue
-            part = np.fromfile(block, dtype).reshape(chunks)
-            at = tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, chunks, strict=True))
-            room = whole[at]
+            if check_regular(Path(block.path)) != block_bytes:
+                raise ValueError(f"block {block.name}; expected {block_bytes} bytes")
+            part = np.fromfile(block.path, dtype).reshape(chunks)
+            room = whole[
+                tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, chunks, strict=True))
+            ]
             room[...] = part[tuple(slice(0, n) for n in room.shape)]
-    except (KeyError, TypeError, ValueError, OSError, ZeroDivisionError) as error:
+    except (LookupError, TypeError, ValueError, OSError, ArithmeticError, SyntaxError) as error:
         raise CheckpointError(f"{path}/{name}: damaged ({error}); record it again") from None
     return whole
 
@@ -178,10 +241,10 @@ def _about(path: Path, name: str) -> dict[str, Any]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_bytes())
+        found = parse_json(read_bounded(path, MOST_JSON_BYTES))
         if not isinstance(found, dict):
             raise ValueError(f"{type(found).__name__} instead of an object")
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise CheckpointError(
             f"{path.parent}: no recorded activity ({error}); expected a folder that "
             "`neuroslam run ... --record cells` has written"

@@ -1,6 +1,7 @@
 """The activity of cells is recorded densely, streams to disk, and goes into others' formats."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from neuroslam.config import build_config, read_preset
 from neuroslam.errors import CheckpointError, ConfigError, RunError
 from neuroslam.runs.activity import parse_record
 from neuroslam.runs.run import resume, run
+from neuroslam.runs.verify import verify
 from neuroslam.state.activity_writer import ActivityWriter
 from neuroslam.state.arrays import ROWS, ArrayFolder, read_array
 from neuroslam.types import Frame, Motion, Pose, PoseEstimate, StepResult, ViewMatch
@@ -189,3 +191,68 @@ def test_an_nwb_file_has_nothing_to_mend_and_comes_back(log, tmp_path):
     np.testing.assert_allclose(file["grid"].times(), log.time_s, atol=1e-6)
     assert len(file["units"]) == len(np.unique(log.spikes("place").cells))
     file.close()
+
+
+def _edit(path, change):
+    about = json.loads(path.read_text())
+    change(about)
+    path.write_text(json.dumps(about))
+
+
+FAULTS = {
+    "rows": (".zarray", lambda a: a["shape"].__setitem__(0, -3), "damaged"),
+    "no shape": (".zarray", lambda a: a.pop("shape"), "damaged"),
+    "rows of a text": (".zarray", lambda a: a.update(shape="ab"), "damaged"),
+    "objects": (".zarray", lambda a: a.update(dtype="|O"), "damaged"),
+    "no dtype": (".zarray", lambda a: a.update(dtype="((("), "damaged"),
+    "blocks of none": (".zarray", lambda a: a.update(chunks=[512, 0]), "damaged"),
+    "small blocks": (".zarray", lambda a: a.update(chunks=[1, 1]), "damaged"),
+    "billions of columns": (".zarray", lambda a: a["shape"].__setitem__(1, 10**13), "see --max"),
+    "cells of a text": (".zattrs", lambda a: a.update(cells="x"), "damaged"),
+    "cells of nothing": (".zattrs", lambda a: a.update(cells={"x": [None, 1]}), "no column of"),
+    "deep": (".zattrs", lambda a: None, "nested too deeply"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_a_log_says_of_itself_is_checked(fault, tmp_path):
+    name, change, message = FAULTS[fault]
+    record("arena:square?minutes=0.02", out=tmp_path / "log", only=["grid"])
+    file = tmp_path / "log" / "grid" / name
+    _edit(file, change)
+    if fault == "deep":
+        file.write_text('{"a":' * 100_000)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        ActivityLog.open(tmp_path / "log")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_log_of_few_blocks_is_read_at_once_and_a_pipe_is_not_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUROSLAM_MAX_MEMORY", "1G")
+    folder = ArrayFolder(tmp_path / "a", {})
+    folder.append(0, {"x": np.ones((3, 1), np.uint8)})
+    _edit(tmp_path / "a" / "x" / ".zarray", lambda a: a.update(shape=[10**5, 5000], chunks=[1, 1]))
+    with pytest.raises(CheckpointError, match=r"block 0\.0; expected 1 bytes"):
+        read_array(tmp_path / "a", "x")  # not half a billion blocks that are not there
+    (tmp_path / "a" / "x" / "0.0").write_bytes(b"\x07")
+    assert read_array(tmp_path / "a", "x").sum() == 7
+    (tmp_path / "a" / "x" / "0.0").unlink()
+    os.mkfifo(tmp_path / "a" / "x" / "0.0")
+    with pytest.raises(CheckpointError, match="is a device or a pipe"):
+        read_array(tmp_path / "a", "x")
+
+
+def test_a_finished_run_has_a_digest_of_its_log_which_rows_after_it_do_not_change(tmp_path):
+    config, out = build_config(read_preset("slrb")), tmp_path / "run"
+    run(WALK, out, config, record=["grid"], tensorboard=False, stop=100)
+    assert json.loads((out / "manifest.json").read_text())["files"]["activity.zarr"]["rows"] == 100
+    late = ActivityWriter.reopen(out / "activity.zarr", 99)
+    late.note(_result(100, 1e3), Frame(100, 1e3), {})
+    late.flush()
+    assert verify(out) == []
+    block = out / "activity.zarr" / "grid" / "0.0"
+    data = bytearray(block.read_bytes())
+    data[1000] ^= 4
+    block.write_bytes(data)
+    assert len(verify(out)) == 1
+    assert "activity.zarr: differs from what was saved" in verify(out)[0]
