@@ -204,6 +204,17 @@ def test_a_name_that_is_not_utf8_is_refused_everywhere(argument, call, tmp_path)
     assert "a\\xff.csv: its name is not UTF-8; rename it" in done.err
 
 
+@pytest.mark.parametrize("command", ["sweep", "fleet", "tune"])
+def test_many_runs_of_a_name_that_is_not_utf8_are_refused(command, call, tmp_path):
+    name = f"{tmp_path}/{os.fsdecode(bytes([0x61, 0xFF]))}.avi"
+    vary = ["--vary", "map.loops=1,2"] if command == "sweep" else []
+    out = ["-o", tmp_path / "o"] if command != "tune" else ["-o", tmp_path / "o.toml"]
+    done = call(command, name, *vary, *out)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "a\\xff.avi" in done.err
+    assert not (tmp_path / "o").exists()
+
+
 def test_in_python_a_video_with_such_a_name_is_refused(tmp_path):
     (tmp_path / os.fsdecode(b"a\xff.avi")).write_bytes(b"RIFF")
     with pytest.raises(SourceError, match="its name is not UTF-8"):
@@ -389,6 +400,36 @@ def test_a_brain_that_has_seen_less_than_no_frames_is_refused(
 
 def test_assignments_still_give_what_they_say():
     assert parse_assignment("view.threshold=0.04") == {"view": {"threshold": 0.04}}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of address space are those of Linux")
+@pytest.mark.parametrize("megabytes", [0, 2, 20])
+def test_a_process_without_memory_says_so_and_keeps_the_earlier_run(megabytes, finished, tmp_path):
+    import resource
+
+    out = shutil.copytree(finished, tmp_path / "o")
+    before = (out / "brain.safetensors").read_bytes()
+    said = tmp_path / "said"
+    child = os.fork()
+    if child == 0:
+        try:
+            os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT), 2)
+            sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+            used = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
+            resource.setrlimit(resource.RLIMIT_AS, (used + megabytes * 10**6,) * 2)
+            words = ["run", "world:corridor?width=640&height=480", "-o", str(out), "--overwrite"]
+            code = main([*words, "--stop", "3", QUICK])
+            sys.stderr.flush()
+        except BaseException as error:
+            os.write(2, f"Traceback {error!r}".encode())
+            code = 1
+        os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in (0, 2), said.read_text()
+    assert "Traceback" not in said.read_text()
+    if code:
+        assert said.read_text().count("\n") == 1
+        assert (out / "brain.safetensors").read_bytes() == before
 
 
 # --- names and files that the system refuses ------------------------------------------------------

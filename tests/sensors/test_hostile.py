@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import os
 import struct
 import tarfile
@@ -374,6 +375,18 @@ def test_the_given_drive_of_50_frames_is_read_whole(cases):
     frames = list(open_source(cases / "kidnap_false_alarm" / "frames.tar.gz"))
     assert [f.index for f in frames] == list(range(50))
     assert len({f.image.shape for f in frames}) == 1
+
+
+@pytest.mark.parametrize("preset", ["auto", "rc_car"])
+def test_a_bump_of_the_given_drive_is_no_kidnapping(preset, cases, tmp_path, call):
+    source = cases / "kidnap_false_alarm" / "frames.tar.gz"
+    preset = () if preset == "auto" else ("--preset", preset)
+    done = call("run", source, "-o", tmp_path / "o", "--no-tensorboard", *preset)
+    assert (done.code, done.err) == (0, "")
+    figures = json.loads((tmp_path / "o" / "metrics.json").read_text())
+    assert figures["frames"] == 50
+    assert figures["not_joined"] == 0
+    assert figures["frames_on_no_joined_map"] == 0
 
 
 # --- links and separators ------------------------------------------------------------------------
