@@ -173,8 +173,8 @@ def digest_of_rows(path: Path, rows: int) -> str:
         try:
             chunks, dtype = [int(n) for n in about["chunks"]], np.dtype(about["dtype"])
             row_bytes = math.prod(chunks[1:]) * dtype.itemsize
-            blocks = {_block_index(block.name, len(chunks)): Path(block.path)
-                      for block in os.scandir(path / name)}  # fmt: skip
+            blocks = {_block_index(block.name, len(chunks)): block
+                      for block in (path / name).iterdir()}  # fmt: skip
             for index in sorted(index for index in blocks if index is not None):
                 size = check_regular(blocks[index])
                 if size > chunks[0] * row_bytes:
@@ -217,15 +217,15 @@ def read_array(path: Path, name: str, rows: int | None = None) -> np.ndarray:
         if not fits(needed):
             raise CheckpointError(f"{path}/{name}: {too_much(needed)}")
         whole, block_bytes = np.zeros(shape, dtype), math.prod(chunks) * dtype.itemsize
-        for block in os.scandir(path / name):  # not all that there could be
+        for block in (path / name).iterdir():  # not all that there could be
             index = _block_index(block.name, len(shape))
             if index is None or any(
                 i * c >= n for i, c, n in zip(index, chunks, shape, strict=True)
             ):
                 continue
-            if check_regular(Path(block.path)) != block_bytes:
+            if check_regular(block) != block_bytes:
                 raise ValueError(f"block {block.name}; expected {block_bytes} bytes")
-            part = np.fromfile(block.path, dtype).reshape(chunks)
+            part = np.fromfile(block, dtype).reshape(chunks)
             room = whole[
                 tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, chunks, strict=True))
             ]
