@@ -106,14 +106,14 @@ def note(i, here, cells):
 
 
 life = simulate(walk, seeds=range(4), hook=note)
-bins = Bins.around(arena.outlines[0], 0.04)
+bins = Bins.around(arena.outlines[0], 0.06)
 seen = walk.positions[::2]
 print(position_errors(life.estimate_m, walk.positions).mean_m.round(3), "m with walls")
 print(position_errors(path_integration(life.senses), walk.positions).mean_m.round(3), "m without")
 
 # %% [markdown]
 # **What to see:** three boundary cells, of other bearings and distances, fire in bands along the walls that
-# lie in their direction; none fires in the middle.
+# lie in their direction; none fires in the middle. White bins were not visited in five minutes.
 
 # %%
 maps = rate_map(seen, np.array(boundary), bins)
@@ -242,9 +242,11 @@ for i, frame in enumerate(frames[:lift] + frames[down:]):
     doubt.append(animal.navigation.familiarity.doubt_s.item())
 figure, axes = plt.subplots(figsize=(7.5, 2.6), layout="constrained")
 axes.plot(np.arange(len(doubt)) / 1200, doubt, color=LOOP)
-axes.axvline(lift / 1200, color=INK, ls="--", lw=1)
-axes.axhline(animal.config.wall_memory.lost_after_s, color=INK, lw=0.6)
-axes.set(xlabel="time (min)", ylabel="doubt (s)")
+axes.axvline(lift / 1200, color=INK, ls="--", lw=1, label="kidnapped")
+limit_s = animal.config.wall_memory.lost_after_s
+axes.axhline(limit_s, color=ROBOT, lw=1, label=f"threshold: lost above {limit_s:g} s")
+axes.set(xlabel="time (min)", ylabel="doubt (s)", xlim=(0, len(doubt) / 1200), ylim=(0, None))
+axes.legend(loc="upper left")
 axes.set_title("Kidnapped at 3.5 min: " + ("lost" if result.lost else "not detected"))
 plt.show()
 

@@ -100,11 +100,42 @@ plot_queries(world, path.position_m, answers, "What the map answers")
 # %% [markdown]
 # A second memory maps positions to pointers; the vector of an area is its key.
 #
-# **What to see:** the square and the orange triangle are in the area, the blue triangle is not.
+# **What to see:** the square and the orange triangle are in the area, the blue triangle is not. The wall is
+# not in it either, yet scores just above the threshold: it is long and was in view for 6.8 s (the square for
+# 2.1 s), and the memory answers "wall" a little (0.05 to 0.09) at every position of the box. One vector for the
+# whole area adds this up over 1.3 m².
 
 # %%
 low, high = np.array([-0.45, -0.45]), np.array([0.9, 0.5])
 plot_area(world, low, high, queries.what(slam, low, high), "What is in the area?")
+
+# %% [markdown]
+# A weak answer everywhere and a strong answer at one position differ if the positions are asked one by one:
+# the largest answer at any of 560 positions of the box, relative to that at the landmark's own positions.
+#
+# **What to see:** the wall is far below the threshold; the blue triangle, 0.15 m outside of the area, is just
+# below it.
+
+# %%
+x, y = np.meshgrid(np.linspace(low[0], high[0], 28), np.linspace(low[1], high[1], 20))
+grid = torch.from_numpy(np.column_stack([x.ravel(), y.ravel()])).float()
+
+
+def strongest(name, positions):
+    """Return the largest answer of a pointer at some positions."""
+    said = slam.places.read(slam.space.encode(positions)).reshape(len(positions), -1)
+    pointer = slam.pointers[slam.names.index(name)]
+    return (said @ pointer / pointer.square().sum()).max().item()
+
+
+amounts = {}
+for landmark in world.landmarks:
+    if landmark.is_point:
+        own = torch.tensor(np.array([landmark.position_m])).float()
+    else:
+        own = torch.tensor(np.array([np.mean(box, axis=0) for box in landmark.boxes_m])).float()
+    amounts[landmark.name] = strongest(landmark.name, grid) / strongest(landmark.name, own)
+plot_area(world, low, high, amounts, "What is in the area, position by position?")
 
 # %% [markdown]
 # One vector can hold the whole map: the sum of all pointers, each bound to its position.

@@ -153,14 +153,14 @@ def plot_queries(
         title: Title of the whole figure.
     """
     n = len(queries) + 1
-    columns = min(3, n)
+    columns = min((4, 3), key=lambda columns: -n % columns) if n > 3 else n  # few panels are empty
     rows = -(-n // columns)
     most = max(float(np.abs(q.similarity).max()) for q in queries)
     with mpl.rc_context(STYLE):
         figure = new_figure(3.5 * columns + 0.7, 3.55 * rows + 0.5, title)
         axes = figure.subplots(rows, columns, squeeze=False)
         draw_world(axes[0, 0], world, path_m)
-        seen_from = "grey: area in which a landmark is visible" if world.view_radius_m > 0 else ""
+        seen_from = "grey: in view there" if world.view_radius_m > 0 else ""
         write_title(axes[0, 0], "World", seen_from)
         for query, ax in zip(queries, axes.ravel()[1:], strict=False):
             draw_query(ax, world, query, most)
@@ -260,11 +260,12 @@ def plot_area(
         colours = [MAP if v > threshold else "#c4c4c4" for v in values]
         bars.barh(np.arange(len(names)), values, color=colours, height=0.7)
         bars.set_yticks(np.arange(len(names)), [n.replace("_", " ").lower() for n in names])
-        bars.invert_yaxis()
-        bars.axvline(threshold, color=LOOP, lw=1.2, ls="--")
+        bars.axvline(threshold, color=LOOP, lw=1.2, ls="--", label=f"threshold {threshold:g}")
         bars.axvline(0.0, color=INK, lw=0.8)
+        bars.set_ylim(len(names) - 0.5, -0.95)  # room for the legend
+        bars.legend(loc="upper right", borderaxespad=0.1)
         bars.set_xlabel("amount in the area (1 inside, 0 outside)")
-        write_title(bars, "Landmarks in the area", "blue: above the dashed threshold")
+        write_title(bars, "Landmarks in the area", "blue: in the area")
     return figure
 
 

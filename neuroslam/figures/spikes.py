@@ -114,7 +114,7 @@ def draw_raster(axes: Axes, spikes: np.ndarray, time_step_s: float, start_s: flo
         xlabel="time (s)",
         ylabel="neuron",
         xlim=(start_s, start_s + len(spikes) * time_step_s),
-        ylim=(-0.5, spikes.shape[1] - 0.5),
+        ylim=(-0.5, max(spikes.shape[1], 1) - 0.5),
     )
     axes.grid(visible=False)
 
@@ -122,7 +122,7 @@ def draw_raster(axes: Axes, spikes: np.ndarray, time_step_s: float, start_s: flo
 def plot_rasters(
     populations: Mapping[str, np.ndarray], time_step_s: float, start_s: float, title: str
 ) -> Figure:
-    """Draw rasters of populations, one below the other.
+    """Draw rasters of populations, one below the other; neurons that never fire have no row.
 
     Args:
         populations: Name -> spikes, ``(steps, neurons)``.
@@ -134,9 +134,11 @@ def plot_rasters(
         figure = new_figure(8.5, 1.7 * len(populations) + 0.7, title)
         axes = figure.subplots(len(populations), 1, sharex=True, squeeze=False).ravel()
         for ax, (name, spikes) in zip(axes, populations.items(), strict=True):
-            draw_raster(ax, spikes, time_step_s, start_s)
-            rate = spikes.mean() / time_step_s
-            write_title(ax, name, f"{spikes.shape[1]} neurons, mean rate {rate:.0f} Hz")
+            active = (spikes != 0).any(axis=0)
+            draw_raster(ax, spikes[:, active], time_step_s, start_s)
+            rate, n = spikes.mean() / time_step_s, spikes.shape[1]
+            some = f"{int(active.sum())} of {n} neurons fire, mean rate of all {rate:.0f} Hz"
+            write_title(ax, name, some)
             ax.label_outer()
     return figure
 
@@ -302,5 +304,8 @@ def plot_signals(time_s: np.ndarray, signals: Mapping[str, np.ndarray], title: s
             ax.plot(time_s, values, color=MAP, lw=0.9)
             ax.set_ylabel(name)
             ax.axhline(0.0, color=ODOMETRY, lw=0.6)
+            if not np.any(values):
+                ax.set_ylim(-0.05, 1.05)
+                ax.text(0.01, 0.5, "0 throughout", transform=ax.transAxes, fontsize=8)
         axes[-1].set(xlabel="time (s)", xlim=(time_s[0], time_s[-1]))
     return figure
