@@ -7,6 +7,7 @@ from inspect import signature
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 import torch
 
@@ -51,14 +52,21 @@ def test_there_are_ten_recipes_of_at_most_15_lines():
 
 def test_rate_maps_of_a_rat_in_a_box(cook):
     names = cook("A rat in a box, to rate maps")
-    assert names["maps"].shape == (264, *names["bins"].shape)
-    assert Path("maps.png").stat().st_size > 10_000
+    assert {name: len(maps) for name, maps in names["maps"].items()}.items() >= {
+        "boundary": 168, "grid": 96
+    }.items()  # fmt: skip
+    assert all(maps.shape[1:] == names["bins"].shape for maps in names["maps"].values())
+    for name in ("boundary", "grid", "place", "raster"):
+        assert Path(f"{name}.png").stat().st_size > 10_000
 
 
 def test_a_track_drives_the_cells(cook):
     names = cook("My track to cells")
-    assert names["activity"].shape == (600, 264 + 120)
-    assert names["activity"].any(axis=0).sum() > 200
+    log = names["log"]
+    assert log.names == ("boundary", "grid", "place", "head_direction")
+    assert [log[name].shape for name in ("boundary", "head_direction")] == [(600, 168), (600, 120)]
+    assert sum(int(log[name].any(axis=0).sum()) for name in log.names) > 200
+    assert np.ptp(log.position_m, axis=0) == pytest.approx([0.6, 0.6], abs=0.01)  # cm to m
 
 
 def test_a_larger_spacing_spreads_the_fields(cook, capsys):
@@ -103,7 +111,7 @@ def test_nwb_is_opened_by_pynapple(cook, capsys):
         pytest.importorskip("pynwb", reason="needs the extra neuro")
         pytest.importorskip("pynapple", reason="needs the extra neuro")
         cook("Export to NWB and open in pynapple")
-    assert "(601, 96)" in capsys.readouterr().out
+    assert re.search(r"\(601, 96\) \d+ units", capsys.readouterr().out)
 
 
 def test_a_figure_of_each_paper(cook, capsys, monkeypatch):
