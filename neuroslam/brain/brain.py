@@ -132,8 +132,13 @@ class NavigationBrain(BrainState):
         """Advance by a checked frame."""
         now = self._enter(accepted)
         observed, leader = accepted.observed, self.leader
+        informed, first = now, {}
+        for population in self._with["inform"]:
+            first[population.kind] = population.step(now, observed[population.kind])
+            informed = population.inform(informed)
         made: list[tuple[Population | None, Correction | None]] = [
-            (p, p.step(now, observed[p.kind])) for p in self._with["step"]
+            (p, first[p.kind] if p.kind in first else p.step(informed, observed[p.kind]))
+            for p in self._with["step"]
         ]
         if self._compass_turns_map:
             made.append((None, self.compass.step(now.compass_rad, now.motion)))

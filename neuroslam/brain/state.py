@@ -200,7 +200,16 @@ class BrainState(QuickModule):
         # Only overridden hooks are called.
         self._with = {
             hook: [p for p in self._populations.values() if _overrides(type(p), hook)]
-            for hook in ("observe", "check", "step", "vetoes", "follow", "learn", "recall")
+            for hook in (
+                "observe",
+                "check",
+                "inform",
+                "step",
+                "vetoes",
+                "follow",
+                "learn",
+                "recall",
+            )
         }
         self._makes_views = any(cls.needs_views for cls in classes)
         uses = {cls.compass for cls in classes}

@@ -229,6 +229,21 @@ class BoundaryCells(BufferModule):
         self.rates = rates.detach()
         return rates
 
+    def tuned_to(self, distance_m: Tensor, bearing_rad: Tensor) -> Tensor:
+        """Return the rates for walls with an open gate; the state does not change.
+
+        Args:
+            distance_m: Distances of walls, ``(..., n_walls)``; ``inf`` for none.
+            bearing_rad: Bearings in the world, the same shape.
+
+        Returns:
+            ``(..., n_bearings, n_distances)``.
+        """
+        return boundary_tuning(
+            distance_m.to(self.rates), bearing_rad.to(self.rates), self.preferred_m,
+            self.preferred_rad, self.sigma_m, self.beta_m, self.sigma_rad,
+        )  # fmt: skip
+
     def respond_compiled(
         self, speed_m_s: float, heading_rad: float, distance_m: np.ndarray,
         relative_rad: np.ndarray, dt_s: float,

@@ -684,6 +684,12 @@ class HeadDirectionCells(Population):
         """Advance by a frame of the brain; return the correction of the heading by the compass."""
         return Correction(turn_rad=self.advance(now.motion, observation))
 
+    def inform(self, now: StepInput) -> StepInput:
+        """Say which heading the ring represents."""
+        if self.batch is not None:
+            return now
+        return now._replace(cells_heading_rad=cast(float, self.heading_rad))
+
     def follow(self, correction: Correction) -> None:
         """Rotate by the heading correction of a landmark or another population."""
         if correction.turn_rad:
@@ -704,6 +710,13 @@ class HeadDirectionCells(Population):
     def rates(self) -> np.ndarray:
         """Activity of every cell, 1 at the peak of a settled bump, ``([batch,] n)``."""
         return (self.activity / self.ring.peak).numpy(force=True)
+
+    def rates_at(
+        self, position_m: np.ndarray, heading_rad: np.ndarray, speed_m_s: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Compute the settled bump at each heading."""
+        settled = bump_at(self.ring, torch.as_tensor(heading_rad).to(self.activity))
+        return {self.kind: (settled / self.ring.peak).numpy(force=True).astype(np.float32)}
 
     def cell_properties(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the preferred direction of each cell."""

@@ -17,7 +17,7 @@ from neuroslam.cells.navigation_state import NavigationEstimate, NavigationState
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.wall_matching import match_walls, outline_of
-from neuroslam.cells.walls import WallMemory
+from neuroslam.cells.walls import WallMemory, walls_around
 from neuroslam.compiled import runs_compiled
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame
@@ -26,7 +26,7 @@ from neuroslam.sensors.frames import checked_number
 from neuroslam.sensors.scan import walls_in_scan
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
-from neuroslam.state.mergeable import State, without_gradients
+from neuroslam.state.mergeable import Arrays, State, without_gradients
 from neuroslam.state.population import (
     Belief,
     Correction,
@@ -48,6 +48,8 @@ from neuroslam.types import (
     PoseEstimate,
     ViewMatch,
 )
+
+_POSES = 512  # at which rates are computed at once
 
 FAMILIARITY_PERIOD_S = 0.5
 """Time between two comparisons of the walls with those known at the place cell."""
@@ -281,11 +283,30 @@ class NavigationCells(Population):
 
     def step(self, now: StepInput, observation: np.ndarray | None) -> Correction:
         """Advance by a frame of the brain; return the walls' correction of position and heading."""
-        before = self.heading_error_rad
-        self._estimate = self._advance(now.motion, now.compass_rad, observation)
+        before, motion, heading = self.heading_error_rad, now.motion, None
+        if self.config.grid_cells.self_motion == "cells":
+            heading = now.cells_heading_rad
+            if now.cells_speed_m_s is not None:
+                motion = motion._replace(v_m_s=now.cells_speed_m_s)
+        self._estimate = self._advance(motion, now.compass_rad, observation, heading)
         dx, dy = self._estimate.correction_m.tolist()
         error = self.heading_error_rad
-        return Correction(dx, dy, before - error, wrap_angle(self.now.heading_rad - error))
+        turn = before - error
+        if heading is not None:
+            turn = self._hand_over(turn, now.compass_rad is not None)
+        return Correction(dx, dy, turn, wrap_angle(self.now.heading_rad - error))
+
+    def _hand_over(self, turn_rad: float, compass: bool) -> float:
+        """Let head-direction cells take over a correction of their heading; return their turn.
+
+        The error of a compass is learnt here: it would turn the cells back. Without a compass the
+        heading is the cells' own, and they keep the correction, which is an error no longer.
+        """
+        if compass or not turn_rad:
+            return 0.0
+        self.walls.errors = self.walls.errors + self.walls.errors.new_tensor([0.0, turn_rad])
+        self.now.heading_rad = wrap_angle(self.now.heading_rad + turn_rad)
+        return turn_rad
 
     def advance(
         self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
@@ -304,11 +325,17 @@ class NavigationCells(Population):
         return self._advance(motion, compass_rad, None if walls is None else checked_walls(walls))
 
     def _advance(
-        self, motion: Motion, compass_rad: float | None, walls: np.ndarray | None
+        self,
+        motion: Motion,
+        compass_rad: float | None,
+        walls: np.ndarray | None,
+        cells_heading_rad: float | None = None,
     ) -> NavigationEstimate:
-        """Do as :meth:`advance` by walls that were checked."""
+        """Do as :meth:`advance` by walls that were checked, and a heading of cells."""
         now, compass, sensed = self.now, compass_rad is not None, walls is not None
-        if compass_rad is not None:
+        if cells_heading_rad is not None:
+            heading = wrap_angle(cells_heading_rad + now.turned_rad)
+        elif compass_rad is not None:
             heading = wrap_angle(checked_number(compass_rad, "heading", "rad") + now.turned_rad)
         else:
             heading = wrap_angle(now.heading_rad + motion.w_rad_s * motion.dt_s)
@@ -523,6 +550,61 @@ class NavigationCells(Population):
             "place": self.place.responses(rates, self.oscillators.position_m),
         }
         return {name: part.numpy(force=True) for name, part in parts.items()}
+
+    def record_into(
+        self, buffers: Mapping[str, np.ndarray], widths: dict[str, int], row: int
+    ) -> bool:
+        """Write the activity of all three kinds of cells by one compiled step."""
+        place = self.place
+        arrays = self.arrays() if place._near is None else None
+        if arrays is None:
+            return False
+        try:
+            rows = buffers["boundary"], buffers["grid"], buffers["place"]
+        except KeyError:  # not all are recorded
+            return False
+        n = place.record_compiled(row, *arrays, *rows)
+        if n >= 0:
+            widths["place"] = n
+        return n >= 0
+
+    @without_gradients
+    def rates_at(
+        self, position_m: np.ndarray, heading_rad: np.ndarray, speed_m_s: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Compute boundary, grid and place cells at some positions of one animal.
+
+        Boundary cells respond to the remembered walls, with an open gate; grid cells are at rest.
+        """
+        if self.batch is not None:
+            return {}
+        at = torch.as_tensor(position_m, dtype=torch.float64, device=self.walls.errors.device)
+        walls, rows = self.walls.remembered()[0], []
+        for some in at.split(_POSES):  # a table of all poses by all walls would be large
+            felt = self.boundary.tuned_to(*walls_around(walls, some, self.config)).flatten(1)
+            grid = self.grid.settled(self.oscillators.phases_at(some)).flatten(1)
+            rows.append((felt, grid, self.place.responses_at(grid, some)))
+        parts = map(torch.cat, zip(*rows, strict=True))
+        named = zip(("boundary", "grid", "place"), parts, strict=True)
+        return {name: part.numpy(force=True).astype(np.float32) for name, part in named}
+
+    def arrays(self) -> Arrays | None:
+        """Return rates of boundary and grid cells, and the position, as arrays of their memory.
+
+        Returns:
+            ``None`` where the steps are not compiled.
+        """
+        felt, grid = self.boundary._buffers["rates"], self.grid._buffers["rates"]
+        at, kept = self.oscillators._buffers["position_m"], self.__dict__.get("_arrays")
+        if kept is not None:
+            tensors = kept[0]
+            if tensors[0] is felt and tensors[1] is grid and tensors[2] is at:
+                return cast(Arrays, kept[1])
+        if not self._compiles():
+            return None
+        kept = (felt, grid, at), tuple(cast(Tensor, one).numpy() for one in (felt, grid, at))
+        self.__dict__["_arrays"] = kept
+        return kept[1]
 
     def cell_properties(self) -> dict[str, dict[str, np.ndarray]]:
         """Return bearing and distance of boundary cells, the spacings of grid cells, and centres.

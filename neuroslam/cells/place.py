@@ -20,6 +20,7 @@ _WINDOW = 32  # nearest cells, which compete
 _SLACK_M = 0.06  # displacement after which the window is looked up again
 _STILL = 1 / 4  # share of threshold_m below which a displacement keeps the winner
 _ROOM = 64  # initial capacity of a table
+_SILENT = -18.0  # logarithm of a response below which it counts as 0: 2e-8
 _NO_CELL = -1
 FAR_M = 1e6
 """Coordinate of the centres of unused rows."""
@@ -287,34 +288,81 @@ def compete_step(
 
 
 @compiled
+def respond_into(
+    grid: np.ndarray, position_m: np.ndarray, power: float, continuity_m: float,
+    n_cells: np.ndarray, weights: np.ndarray, centres_m: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Write what :func:`place_response` gives for all cells of one animal into ``out``.
+
+    Responses below 2e-8 are 0. A product in single precision, which is fast, finds the cells that
+    may respond more; only of these the response is computed, in double precision.
+    """
+    square, last = 0.0, grid.size - grid.size % 4
+    for k in range(grid.size):
+        square += np.float64(grid[k]) * grid[k]
+    scale, n = 1.0 / max(math.sqrt(square), 1e-12), n_cells[0]
+    near = np.empty(_ROOM)
+    for first in range(0, n, _ROOM):  # cells that were recruited one after the other lie together
+        size, closest = min(_ROOM, n - first), -np.inf
+        for i in range(size):
+            dx = centres_m[0, first + i, 0] - position_m[0]
+            dy = centres_m[0, first + i, 1] - position_m[1]
+            near[i] = (dx * dx + dy * dy) * (-0.5 / continuity_m**2)
+            closest = max(closest, near[i])
+            out[first + i] = 0.0
+        if closest < _SILENT:
+            continue
+        alike = np.dot(weights[0, first : first + size], grid)
+        for i in range(size):
+            # ln s <= s - 1; the margin is above the rounding of single precision
+            if power * (min(alike[i] * scale, 1.0) - 1.0 + 1e-5) + near[i] < _SILENT:
+                continue
+            a = b = c = d = 0.0
+            w = weights[0, first + i]
+            for k in range(0, last, 4):
+                a += w[k] * np.float64(grid[k])
+                b += w[k + 1] * np.float64(grid[k + 1])
+                c += w[k + 2] * np.float64(grid[k + 2])
+                d += w[k + 3] * np.float64(grid[k + 3])
+            for k in range(last, grid.size):
+                a += w[k] * np.float64(grid[k])
+            similarity = ((a + b) + (c + d)) * scale
+            if similarity > 0.0 and power * (min(similarity, 1.0) - 1.0) + near[i] >= _SILENT:
+                out[first + i] = similarity**power * math.exp(near[i])
+
+
+@compiled
 def responses_step(
     grid: np.ndarray, position_m: np.ndarray, power: float, continuity_m: float,
     n_cells: np.ndarray, weights: np.ndarray, centres_m: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Do as :func:`place_response` for all cells of one animal; those far away respond with 0."""
-    out = np.zeros(n_cells[0], np.float32)
-    rates, square = grid.reshape(-1).astype(np.float64), 0.0
-    for k in range(rates.size):
-        square += rates[k] * rates[k]
-    scale = 1.0 / max(math.sqrt(square), 1e-12)
-    for j in range(out.size):
-        dx, dy = centres_m[0, j, 0] - position_m[0], centres_m[0, j, 1] - position_m[1]
-        near = (dx * dx + dy * dy) * (-0.5 / continuity_m**2)
-        if near < -18.0:  # six standard deviations: less than 2e-8
-            continue
-        a = b = c = d = 0.0  # four sums at a time, which the processor does at once
-        w, last = weights[0, j], rates.size - rates.size % 4
-        for k in range(0, last, 4):
-            a += w[k] * rates[k]
-            b += w[k + 1] * rates[k + 1]
-            c += w[k + 2] * rates[k + 2]
-            d += w[k + 3] * rates[k + 3]
-        for k in range(last, rates.size):
-            a += w[k] * rates[k]
-        similarity = (a + b) + (c + d)
-        if similarity > 0.0:
-            out[j] = (similarity * scale) ** power * math.exp(near)
+    """Do as :func:`place_response` for all cells of one animal; those below 2e-8 are 0."""
+    out = np.empty(n_cells[0], np.float32)
+    respond_into(grid, position_m, power, continuity_m, n_cells, weights, centres_m, out)
     return out
+
+
+@compiled
+def record_step(
+    row: int, felt: np.ndarray, grid: np.ndarray, position_m: np.ndarray, power: float,
+    continuity_m: float, n_cells: np.ndarray, weights: np.ndarray, centres_m: np.ndarray,
+    felt_rows: np.ndarray, grid_rows: np.ndarray, place_rows: np.ndarray,
+) -> int:  # fmt: skip
+    """Write boundary, grid and place cells of one animal into a row of three tables.
+
+    Returns:
+        Number of place cells; -1 if the table is too narrow for them, and nothing was written.
+    """
+    n = n_cells[0]
+    if n > place_rows.shape[1]:
+        return -1
+    rates = grid.reshape(-1)
+    felt_rows[row, : felt.size] = felt.reshape(-1)
+    grid_rows[row, : rates.size] = rates
+    respond_into(
+        rates, position_m, power, continuity_m, n_cells, weights, centres_m, place_rows[row]
+    )
+    return int(n)
 
 
 class Stay(Scalars):
@@ -512,10 +560,38 @@ class CompetitiveHebbianPlaceCells(BufferModule):
         response = place_response(weights, away, grid, c.power, c.continuity_m)
         return response[0] if one else response
 
+    @without_gradients
+    def responses_at(self, grid: Tensor, position_m: Tensor) -> Tensor:
+        """Return the responses of all cells of one animal at many positions, ``(t, n)``.
+
+        Args:
+            grid: Rates of the grid cells at each, ``(t, n_grid)``.
+            position_m: The positions, ``(t, 2)``.
+        """
+        self._write_back()
+        c, n = self.config, int(self.n_cells[0])
+        grid = torch.nn.functional.normalize(grid.to(self.weights), dim=-1)
+        away = torch.cdist(position_m.to(self.centres_m), self.centres_m[0, :n]).square()
+        similarity = (grid @ self.weights[0, :n].mT).clamp_min(0.0)
+        near = (away * (-0.5 / c.continuity_m**2)).exp().to(similarity)
+        return similarity.pow(c.power) * near
+
     def responses_compiled(self, grid: np.ndarray, position_m: np.ndarray) -> np.ndarray:
         """Do as :meth:`responses` for one animal; what the cells have learnt is in the tables."""
         c, (n_cells, weights, centres, *_) = self.config, cast(Arrays, self.arrays())
+        grid = np.ascontiguousarray(grid, weights.dtype)
         return responses_step(grid, position_m, c.power, c.continuity_m, n_cells, weights, centres)
+
+    def record_compiled(
+        self, row: int, felt: np.ndarray, grid: np.ndarray, position_m: np.ndarray,
+        felt_rows: np.ndarray, grid_rows: np.ndarray, place_rows: np.ndarray,
+    ) -> int:  # fmt: skip
+        """Do as :func:`record_step` with the tables of these cells."""
+        c, (n_cells, weights, centres, *_) = self.config, cast(Arrays, self.arrays())
+        return record_step(
+            row, felt, grid, position_m, c.power, c.continuity_m, n_cells, weights, centres,
+            felt_rows, grid_rows, place_rows,
+        )  # fmt: skip
 
     @without_gradients
     def bump(self, grid: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -326,10 +326,25 @@ class SpeedCells(Population):
         """Advance by a frame of the brain."""
         self.advance(now.motion)
 
+    def inform(self, now: StepInput) -> StepInput:
+        """Say which speed the cells represent, with the direction of the measured one."""
+        if self.batch is not None:
+            return now
+        speed = math.copysign(cast(float, self.speed_m_s), now.motion.v_m_s)
+        return now._replace(cells_speed_m_s=speed)
+
     @property
     def rates(self) -> np.ndarray:
         """Rate of every cell in Hz, ``([batch,] n)``."""
         return self.rates_hz.numpy(force=True).copy()
+
+    def rates_at(
+        self, position_m: np.ndarray, heading_rad: np.ndarray, speed_m_s: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Compute the rates at each speed, without noise and acceleration."""
+        speed = torch.as_tensor(speed_m_s).abs().to(self.rates_hz)
+        rates = speed_rates(speed, torch.zeros_like(speed), self.tuning, self.config.max_speed_m_s)
+        return {self.kind: rates.numpy(force=True).astype(np.float32)}
 
     def counts(self) -> dict[str, float]:
         """Return the number of cells."""

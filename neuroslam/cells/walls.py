@@ -18,7 +18,7 @@ from neuroslam.cells import wall_table
 from neuroslam.cells.boundary_vectors import Wall, wall_innovation, wrap
 from neuroslam.cells.wall_table import OWN, WallTable
 from neuroslam.compiled import compiled
-from neuroslam.config import WallMemoryConfig
+from neuroslam.config import BrainConfig, WallMemoryConfig
 from neuroslam.geometry import TWO_PI
 from neuroslam.state.mergeable import Arrays, without_gradients
 
@@ -314,6 +314,44 @@ def evidence_step(
     supports = accepted[0] and against < 1.0
     rejected[0] = accepted[0] = False
     return against, supports
+
+
+def walls_around(
+    wall: Wall, position_m: Tensor, config: BrainConfig, most: int = 3
+) -> tuple[Tensor, Tensor]:
+    """Return the remembered walls that an animal would sense at some positions.
+
+    Of all segments with a similar bearing (within 25°) the one remembered nearest counts; a segment
+    extends ``wall_memory.spread_m`` to either side of where it was sensed.
+
+    Args:
+        wall: All remembered segments, as columns ``(w,)``.
+        position_m: Positions, ``(t, 2)``.
+        config: Of the brain.
+        most: Largest number of walls at a position.
+
+    Returns:
+        Distances and bearings in the world, ``(t, most)``; ``inf`` and 0 where there is none.
+    """
+    n = len(position_m)
+    found = position_m.new_full((n, most), math.inf), position_m.new_zeros(n, most)
+    if not len(wall.x_m):
+        return found
+    dx, dy = wall.x_m - position_m[:, :1], wall.y_m - position_m[:, 1:]
+    nx, ny = wall.bearing_rad.cos(), wall.bearing_rad.sin()
+    distance = wall.distance_m + dx * nx + dy * ny
+    abreast = (dy * nx - dx * ny).abs() <= config.wall_memory.spread_m
+    reach = config.boundary_cells.reach_m
+    free = abreast & (distance >= 0.0) & (distance <= reach)
+    away, rows = dx.square() + dy.square(), torch.arange(n, device=position_m.device)
+    for k in range(most):
+        best = away.where(free, math.inf).argmin(1)
+        there = free[rows, best]
+        found[0][:, k] = distance[rows, best].where(there, math.inf)
+        found[1][:, k] = wall.bearing_rad[best].where(there, 0.0)
+        apart = wrap(wall.bearing_rad - wall.bearing_rad[best].unsqueeze(1)).abs()
+        free = free & (apart > _ALIKE_RAD) & there.unsqueeze(1)
+    return found
 
 
 class WallMemory(WallTable):

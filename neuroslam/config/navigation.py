@@ -125,6 +125,11 @@ class GridCellConfig(Section):
         description="learning rate of the weights from the oscillators; larger: faster, less "
         "stable",
     )
+    self_motion: Literal["measured", "cells"] = Field(
+        default="measured",
+        description="what moves the phases: the measured speed and heading, or those of speed and "
+        "head-direction cells, as far as the brain has them",
+    )
     lateral_rate: float = Field(
         default=0.0005,
         ge=0,

@@ -20,7 +20,9 @@ from neuroslam.state.arrays import (
 from neuroslam.state.population import Population
 from neuroslam.types import Frame, StepResult
 
+_BUFFER = 4 * ROWS  # samples that are written at once: each writing opens every array
 _FLUSH_S = 2.0  # wall-clock time after which rows are written, though their block is not full
+_ROUNDING = 1e-6  # share of a sample
 _UNKNOWN = (np.nan, np.nan, np.nan)
 
 
@@ -28,7 +30,7 @@ class ActivityWriter:
     """Records the activity of a brain's cells: to disk while it runs, or into memory.
 
     A sample is taken at most ``rate_hz`` times a second of the source's time. On disk rows are
-    written every 512 samples, or two seconds of wall-clock time: what a killed run can lose.
+    written every 2048 samples, or two seconds of wall-clock time: what a killed run can lose.
 
     Args:
         path: Folder to write; ``None``: keep the samples in memory.
@@ -94,7 +96,7 @@ class ActivityWriter:
         return writer
 
     def _number(self, time_s: float) -> int:
-        return int((time_s - cast(float, self._start_s)) * self.rate_hz + 1e-6)
+        return int((time_s - cast(float, self._start_s)) * self.rate_hz + _ROUNDING)
 
     def note(self, result: StepResult, frame: Frame, populations: Mapping[str, Population]) -> None:
         """Take a sample, if one is due.
@@ -107,31 +109,36 @@ class ActivityWriter:
         Raises:
             ConfigError: If a population to record is none of those of the brain.
         """
+        time_s = result.time_s
         if self._start_s is None:
-            self._start_s = result.time_s
-        number = self._number(result.time_s)
+            self._start_s = time_s
+        number = int((time_s - self._start_s) * self.rate_hz + _ROUNDING)
         if number <= self._last:
             return
         self._last = number
-        i = self._n
-        pose, truth = result.pose, frame.truth or _UNKNOWN
-        self._path_rows.append((result.time_s, result.frame, *truth, *pose, result.motion.v_m_s))
+        i, truth = self._n, frame.truth or _UNKNOWN
+        self._path_rows.append((time_s, result.frame, *truth, *result.pose, result.motion.v_m_s))
         for population in populations.values():
-            for name, rates in population.recorded().items():
-                if self.only is not None and name not in self.only:
-                    continue
-                n = len(rates)
-                buffer = self._buffers.get(name)
-                if buffer is None or buffer.shape[1] < n:
-                    buffer = self._widened(name, n, population)
-                buffer[i, :n] = rates
-                if n > self._widths[name]:
-                    self._widths[name] = n
+            if not population.record_into(self._buffers, self._widths, i):
+                self._copy(population, i)
         self._n = i + 1
         if i == 0 and self.only is not None and not self._rows:
             self._refuse_unknown(populations)
-        if self._n == ROWS or time.monotonic() - self._flushed > _FLUSH_S:
+        if self._n == _BUFFER or time.monotonic() - self._flushed > _FLUSH_S:
             self.flush()
+
+    def _copy(self, population: Population, i: int) -> None:
+        """Write what a population records into row ``i`` of the buffers."""
+        for name, rates in population.recorded().items():
+            if self.only is not None and name not in self.only:
+                continue
+            n = len(rates)
+            buffer = self._buffers.get(name)
+            if buffer is None or buffer.shape[1] < n:
+                buffer = self._widened(name, n, population)
+            buffer[i, :n] = rates
+            if n > self._widths[name]:
+                self._widths[name] = n
 
     def _widened(self, name: str, n: int, population: Population) -> np.ndarray:
         """Return a buffer for as many cells, which holds what the one before held."""
@@ -145,9 +152,9 @@ class ActivityWriter:
             self._names.append(name)
             self._units[name] = population.rate_units.get(name, "1")
         if before is None:
-            buffer = np.zeros((ROWS, n), np.float32)
+            buffer = np.zeros((_BUFFER, n), np.float32)
         else:
-            buffer = np.zeros((ROWS, max(n, 2 * before.shape[1])), np.float32)
+            buffer = np.zeros((_BUFFER, max(n, 2 * before.shape[1])), np.float32)
             buffer[: self._n, : before.shape[1]] = before[: self._n]
         self._buffers[name] = buffer
         self._widths.setdefault(name, n)

@@ -46,6 +46,8 @@ class StepInput(NamedTuple):
         compass_rad: Heading by a compass; ``None``: it has none.
         vetoed: A population contradicts that the robot is where the view was learnt.
         tracking: What the sequence of views says; ``None``: each view decides by itself.
+        cells_heading_rad: Heading that a population represents; ``None``: none does.
+        cells_speed_m_s: Speed that a population represents, likewise.
     """
 
     frame: int
@@ -54,6 +56,8 @@ class StepInput(NamedTuple):
     compass_rad: float | None = None
     vetoed: bool = False
     tracking: Tracking | None = None
+    cells_heading_rad: float | None = None
+    cells_speed_m_s: float | None = None
 
 
 class Correction(NamedTuple):
@@ -232,6 +236,13 @@ class Population(Mergeable):
     def step(self, now: StepInput, observation: Observation) -> Correction | None:
         """Advance by self-motion and the population's own senses; return what those corrected."""
 
+    def inform(self, now: StepInput) -> StepInput:
+        """Add the self-motion that the population represents, for the steps of the others.
+
+        A population that overrides this steps before those that do not.
+        """
+        return now
+
     def vetoes(self, view: ViewMatch) -> bool:
         """Tell whether the robot cannot be where a view was learnt."""
         return False
@@ -288,6 +299,38 @@ class Population(Mergeable):
         """
         rates = self.rates
         return {} if rates is None else {self.kind: rates}
+
+    def record_into(
+        self, buffers: Mapping[str, np.ndarray], widths: dict[str, int], row: int
+    ) -> bool:
+        """Write what :meth:`recorded` returns into a row of the buffers, where that is faster.
+
+        Args:
+            buffers: Tables by recorded name, ``(rows, n)`` float32, as wide as they were so far.
+            widths: Number of cells by recorded name, to raise where cells were recruited.
+            row: Of the tables; its columns are 0.
+
+        Returns:
+            Whether all was written; if not, :meth:`recorded` is asked.
+        """
+        return False
+
+    def rates_at(
+        self, position_m: np.ndarray, heading_rad: np.ndarray, speed_m_s: np.ndarray
+    ) -> Mapping[str, np.ndarray]:
+        """Compute the activity by recorded name at some poses, with the cells as they are now.
+
+        Figures of a run that recorded no activity use it; nothing changes.
+
+        Args:
+            position_m: In the frame of the cells, ``(t, 2)``.
+            heading_rad: Likewise, ``(t,)``.
+            speed_m_s: Speed at each pose, ``(t,)``.
+
+        Returns:
+            Each ``(t, n_cells)``; nothing where that cannot be computed.
+        """
+        return {}
 
     def cell_properties(self) -> Mapping[str, Mapping[str, np.ndarray]]:
         """Return what each recorded cell is tuned to: columns ``(n_cells,)`` by recorded name.

@@ -140,7 +140,7 @@ def place_cells(rng):
     return pairs + states(ours, theirs)
 
 
-@case("cells.place.responses_step")
+@case("cells.place.responses_step", "cells.place.record_step")
 @torch.inference_mode()
 def place_cell_responses(rng):
     config = PlaceCellConfig()
@@ -156,7 +156,17 @@ def place_cell_responses(rng):
     compiled = cells.responses(grid, torch.from_numpy(at))  # first: it completes the weights
     weights = cells.weights[:, :n].double()
     said = place_response(weights, away, unit, config.power, config.continuity_m)[0]
-    return [(said.float().numpy(), compiled.numpy())]
+    felt, tables = rng.random((3, 2)).astype(np.float32), [np.zeros((2, m), np.float32) for m in
+                                                           (6, 26, n + 3)]  # fmt: skip
+    wrote = cells.record_compiled(1, felt, grid.numpy().reshape(2, 13), at, *tables)
+    narrow = cells.record_compiled(1, felt, grid.numpy(), at, *tables[:2], tables[2][:, : n - 1])
+    expected = [felt.flatten(), grid.numpy(), np.append(compiled.numpy(), np.zeros(3, np.float32))]
+    return [
+        (said.float().numpy(), compiled.numpy()),
+        (np.array([n, -1]), np.array([wrote, narrow])),
+        *zip(expected, (table[1] for table in tables), strict=True),
+        *((np.zeros_like(table[0]), table[0]) for table in tables),
+    ]
 
 
 @case("cells.walls.move_step", "cells.walls.predict_step", "cells.walls.correct_step",
