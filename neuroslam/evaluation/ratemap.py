@@ -159,7 +159,12 @@ class RateMaps:
         both.n_outside = self.n_outside + other.n_outside
         return both
 
-    def maps(self, sigma_bins: float = 1.5, min_occupancy_samples: float = 1.0) -> np.ndarray:
+    def maps(
+        self,
+        sigma_bins: float = 1.5,
+        min_occupancy_samples: float = 1.0,
+        closing_bins: int = 0,
+    ) -> np.ndarray:
         r"""Return mean activity per bin, smoothed, ``(N, n_y, n_x)``; NaN where unvisited.
 
         .. math:: \lambda(x) = \frac{\sum_{x'} G(x - x') \, S(x')}{\sum_{x'} G(x - x') \, T(x')}
@@ -170,8 +175,17 @@ class RateMaps:
         Args:
             sigma_bins: Standard deviation of the Gaussian :math:`G`; 0 does not smooth.
             min_occupancy_samples: A bin with fewer samples is unvisited.
+            closing_bins: Fill gaps between visited bins, up to twice so many bins wide, with what
+                the smoothing gives there; the outline of the visited bins stays.
         """
         visited = self.counts >= max(min_occupancy_samples, 1e-12)
+        if closing_bins and sigma_bins > 0.0:
+            from scipy import ndimage
+
+            wide = np.pad(visited, closing_bins)  # else the edge of the map would be a gap
+            square = np.ones((3, 3), bool)
+            closed = ndimage.binary_closing(wide, square, iterations=closing_bins)
+            visited |= closed[closing_bins:-closing_bins, closing_bins:-closing_bins]
         sums, counts = self.sums, self.counts
         if sigma_bins > 0.0:
             from scipy import ndimage

@@ -16,11 +16,13 @@ from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.errors import MapError, counted
 from neuroslam.evaluation.trajectory import align
+from neuroslam.figures.style import render
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.decisions import cells_apart
 from neuroslam.report.reading import Curve, FinishedRun
 from neuroslam.report.rows import config_rows, metric_rows
+from neuroslam.runs.cells import activity_of, draw_cells
 from neuroslam.runs.reading import (
     experiences_of,
     odometry_track,
@@ -99,6 +101,7 @@ def collect(run: FinishedRun) -> Facts:
         "truth_scale": truth_on_map(trajectory(run.brain, run.trace), true_poses(run.trace))[1],
         "lost": [_within(rows, span) for span in lost_spans(run)],
         "populations": populations(run.brain),
+        "activity": activity(run),
         "notes": notes,
         **_words(run.brain),
     }  # fmt: skip
@@ -310,6 +313,22 @@ def populations(brain: NavigationBrain) -> list[dict[str, Any]]:
         if card["counts"] or card["pictures"]:
             cards.append(card)
     return cards
+
+
+def activity(run: FinishedRun) -> dict[str, Any]:
+    """Draw the cells of a run as ``neuroslam plot`` does: a figure for each kind, and a raster."""
+    log, note = activity_of(run.out, run.brain, run.trace)
+    figures = []
+    for name, drawn in ({} if log is None else draw_cells(log, "", most=5)).items():
+        kind = name.removeprefix("cells_").removesuffix(".png").replace("_", " ")
+        title = "All cells over time" if name == "raster.png" else f"{kind.capitalize()} cells"
+        pixels = render(drawn, dpi=90)
+        bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, 101])[1]  # without loss
+        height, width = pixels.shape[:2]
+        picture = base64.b64encode(data.tobytes()).decode()
+        figures.append({"title": title, "webp": picture, "width": width, "height": height})
+    return {"note": note, "figures": figures}
 
 
 def _plain(text: str) -> str:

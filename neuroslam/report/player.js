@@ -186,6 +186,7 @@ async function start() {
   startLayers();
   startCharts();
   startCells();
+  startActivity();
   startPopulations();
   startSessions();
   startMetrics();

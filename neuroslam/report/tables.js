@@ -69,6 +69,20 @@ function reportCard(outcome, report, point) {
   return card;
 }
 
+// Figures of `neuroslam plot`: the first is open, the others open at a click.
+function startActivity() {
+  const { note, figures } = about.activity;
+  $("activity").hidden = $("to-activity").hidden = !figures.length;
+  $("activity-note").textContent = note && `Activity ${note}.`;
+  figures.forEach(({ title, webp, width, height }, i) => {
+    const image = make("img", { class: "drawn", src: `data:image/webp;base64,${webp}`, width, height,
+      alt: `${title}: rate maps, autocorrelograms and tuning curves, or activity over time` });
+    const card = make("details", { class: "card text" }, make("summary", { text: title }), image);
+    card.open = i === 0;
+    $("activity-list").append(card);
+  });
+}
+
 // Populations tell their counts and pictures themselves: the page need not know them.
 function startPopulations() {
   $("populations").hidden = $("to-populations").hidden = !about.populations.length;

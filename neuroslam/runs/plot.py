@@ -16,6 +16,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_activity, plot_map, plot_pose_cells, plot_signals
 from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import plain_text, save, shortened
+from neuroslam.runs.cells import activity_of, draw_cells
 from neuroslam.runs.files import RunPlan, brain_file
 from neuroslam.runs.reading import (
     length_unit,
@@ -33,9 +34,10 @@ _TITLE_WIDTH = 90  # characters
 
 
 def plot(out: str | Path, to: str | Path) -> list[Path]:
-    """Draw the figures of a run: map, cells at its end, view matches and counts over time.
+    """Draw the figures of a run: map, cells, activity, view matches and counts over time.
 
-    Only cells, views and walls that the brain has are drawn.
+    Only cells, views and walls that the brain has are drawn. The cells of an animal have rate maps,
+    autocorrelograms and tuning curves, and a raster: as recorded, or computed along its path.
 
     Returns:
         The files that were written.
@@ -61,6 +63,9 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
                             f"{name}, which is another figure; rename"
                         )
                     figures[name] = plot_activity(picture, tag)
+        log, note = activity_of(out, brain, trace)
+        if log is not None:
+            figures |= draw_cells(log, note)
         figures["signals.png"] = plot_signals(frames, brain.config.view.threshold)
         for name, figure in figures.items():
             save(figure, to / name)
