@@ -137,7 +137,7 @@ CLAIMS: list[Claim] = [
     Claim("multisession", "Sect. 5.1.1", "experiences; as many as in a single session",
           "virtual-tour", {"map": "multi-session"}, "experiences", None, "==", 127, 0.0, full=127),
     Claim("multisession", "Fig. 12", "experiences without the shift; more than with it",
-          "virtual-tour-no-shift", {}, "experiences", None, ">=", 128),
+          "virtual-tour-no-shift", {}, "experiences", None, ">=", 128, full=130, quick=130),
     *_multisession("lab-tour", "Sect. 5.2, Figs. 13, 14", 0.0040, 2),
     *_multisession("five-sessions", "Sect. 5.3, Figs. 15, 16", 0.0051, 5),
     *_multisession("campus", "Sect. 5.4, Figs. 17, 18", 0.0030, 3),
