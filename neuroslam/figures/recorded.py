@@ -14,6 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
+from matplotlib.ticker import MaxNLocator
 
 from neuroslam.errors import counted
 from neuroslam.evaluation.directions import head_direction_tuning
@@ -219,6 +220,7 @@ def _draw_map(figure: Figure, axes: Axes, measured: CellMaps, k: int, unit: str)
         shown, ACTIVITY, origin="lower", extent=measured.bins.extent_m, vmin=0.0, vmax=top or 1.0
     )
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
     axes.grid(visible=False)
     bar = figure.colorbar(picture, ax=axes, shrink=0.8, ticks=(0.0, top or 1.0))
     bar.ax.set_yticklabels(["0", f"{top:.2g}"])
@@ -236,6 +238,7 @@ def _draw_correlation(axes: Axes, measured: CellMaps, k: int) -> None:
     y, x = (bin_m * n / 2.0 for n in r.shape)
     axes.imshow(r, _CORRELATION, origin="lower", extent=(-x, x, -y, y), vmin=-1.0, vmax=1.0)
     axes.set(xlabel="shift in x (m)", ylabel="shift in y (m)", aspect="equal")
+    axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
     axes.grid(visible=False)
     score = measured.scores[k]
     write_title(axes, "", f"grid score {score:.2f}" if np.isfinite(score) else "no grid score")
