@@ -29,6 +29,7 @@ PLAN = [line.split() for line in """
     figures
     adapters
     runs report tuning experiments
+    ros
     cli
     __main__
 """.strip().splitlines()]  # fmt: skip

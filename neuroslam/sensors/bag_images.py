@@ -77,7 +77,7 @@ def pixels_of(message: Any) -> np.ndarray:  # noqa: ANN401
     channels, size = ENCODINGS[encoding][:2]
     dtype = np.dtype(f"u{size}").newbyteorder(">" if message.is_bigendian else "<")
     h, w, used = message.height, message.width, message.width * channels * size
-    data = np.asarray(message.data, np.uint8)
+    data = np.frombuffer(message.data, np.uint8)  # an array, or bytes as ROS 1 has them
     if not used or not h or message.step < used or len(data) < h * message.step:
         raise BadFrame(
             f"{len(data)} bytes in rows of {message.step} for {w} x {h} px {encoding}; "
