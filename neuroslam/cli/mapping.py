@@ -81,6 +81,12 @@ def run_command(
             metavar="FILE", help="Write an MCAP file too, for Foxglove; needs the extra mcap."
         ),
     ] = None,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Open rerun's viewer; needs the extra rerun.")
+    ] = False,
+    rerun_save: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a recording for rerun, FILE.rrd.")
+    ] = None,
     save_every: SaveEvery = 60.0,
     overwrite: Overwrite = False,
     dry_run: Annotated[
@@ -130,6 +136,8 @@ def run_command(
             on_bad_frame=on_bad_frame.value,
             tensorboard=not no_tensorboard,
             mcap=mcap,
+            rerun=rerun,
+            rerun_save=rerun_save,
             overwrite=overwrite,
             on_step=on_step,
             on_start=on_start,

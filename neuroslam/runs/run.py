@@ -112,6 +112,8 @@ def run(
     on_bad_frame: OnBadFrame = "stop",
     tensorboard: bool = True,
     mcap: str | Path | None = None,
+    rerun: bool = False,
+    rerun_save: str | Path | None = None,
     overwrite: bool = False,
     on_step: Callable[[StepResult], None] | None = None,
     on_start: Callable[[int | None], None] | None = None,
@@ -142,6 +144,8 @@ def run(
         on_bad_frame: ``stop`` at an unusable frame, or ``skip`` and count it.
         tensorboard: Write ``events/`` too.
         mcap: File to write for Foxglove, see :mod:`neuroslam.runs.mcap`; extra ``mcap``.
+        rerun: Open the viewer of rerun, see :mod:`neuroslam.runs.rerun`; extra ``rerun``.
+        rerun_save: File to write for rerun (``.rrd``).
         overwrite: Replace the files of an earlier run in ``out``.
         on_step: Called after each frame with its result.
         on_start: Called once with the frame to stop before; ``None``: unknown.
@@ -221,6 +225,11 @@ def run(
                     from neuroslam.runs.mcap import McapRecorder
 
                     recorder = Recorders([recorder, McapRecorder(Path(mcap))])
+                if rerun or rerun_save is not None:
+                    from neuroslam.runs.rerun import RerunRecorder
+
+                    file = None if rerun_save is None else Path(rerun_save)
+                    recorder = Recorders([recorder, RerunRecorder(file, rerun)])
                 due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
                 steps = chain([first], steps)
                 _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)

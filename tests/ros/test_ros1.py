@@ -144,8 +144,11 @@ def python(code, *words, env, **more):
 
 def test_a_played_bag_is_mapped_and_everything_is_received(ros, ros1_bag, conversation, tmp_path):
     stored = tmp_path / "map.safetensors"
-    words = ["_image_topic:=/camera", "_odometry_topic:=/odom", "_scan_topic:=/scan",
-             "_set:=frame_rate_hz=10 view.threshold=0.06", f"_map_file:={stored}", "_lag_s:=10.0"]  # fmt: skip
+    words = {
+        "image_topic": "/camera", "odometry_topic": "/odom", "scan_topic": "/scan",
+        "set": "frame_rate_hz=10 view.threshold=0.06", "map_file": stored, "lag_s": 10.0,
+    }  # fmt: skip
+    words = [f"_{name}:={value}" for name, value in words.items()]
     with (
         python(NODE, *words, env=ros) as node,
         python(CLIENT, env=ros, stdin=subprocess.PIPE) as client,
