@@ -23,6 +23,9 @@ _APART = 6
 _AHEAD = 3
 """Links that the robot may pass in a frame."""
 
+_BESIDE = (2.5, 0.8)
+"""Distance, in median links, and heading, rad, up to which two experiences are the same place."""
+
 _SUDDEN = 0.75
 """Change between two frames, as a share of the mean match error, that may be a kidnapping."""
 
@@ -87,7 +90,7 @@ class _State(Scalars):
     Attributes:
         mode: A :class:`Mode`.
         frames: Number of frames in which the robot moved.
-        doubts: Frames since an abrupt change.
+        doubts: Frames since an abrupt change; at known places, as long as none fits them.
         streak: Frames in a row that agree on ``candidate``.
         candidate: Experience that the robot may be at.
         began: Where the candidates of the streak began.
@@ -227,9 +230,11 @@ class SequenceTracker(Mergeable):
             s.turn_rad = wrap_angle(s.turn_rad + motion.w_rad_s * motion.dt_s)
             dx, dy = rotate(motion.v_m_s * motion.dt_s, 0.0, s.turn_rad)
             s.dx_m, s.dy_m = s.dx_m + dx, s.dy_m + dy
-        if alarm and s.mode == Mode.EXPLORES:  # at known places the evidence itself shows a jump
+        if alarm and s.mode == Mode.EXPLORES:
             s.mode, s.doubts = Mode.DOUBTS, 0
             self._forget()
+        elif alarm and self.tracks:  # the next frames decide
+            s.doubts = 1
         self.new_view, self.seen = None, Seen()
         if not map_.n:
             return Tracking("explore", current)
@@ -264,12 +269,12 @@ class SequenceTracker(Mergeable):
 
         if doubting:
             near = around(current, _APART, _APART + s.doubts)
-            return self._doubt(costs, relative, near, around, current)
+            return self._doubt(costs, compared, near, around, map_)
         if self.tracks:
             return self._track(costs, compared, around, map_)
         best = int(costs.argmin())
-        rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
-        jump = self._jumped(compared, around, current)
+        rival = np.where(around(best, _APART, _APART) | _beside(best, map_), UNKNOWN, costs).min()
+        jump = self._jumped(compared, around, map_)
         if jump != NO_EXPERIENCE:
             return self._go(self._closing(jump, map_), jump, costs[jump], rival)
         if self._confirmed(best, costs[best], rival, around):
@@ -305,11 +310,15 @@ class SequenceTracker(Mergeable):
             if around(current, 0, min(2 * driven + _APART, map_.n // 3))[best]:
                 return self._go("at", best, elsewhere[best], costs[here])  # it lagged behind
             return self._correct(best, elsewhere[best], costs[here], map_)
-        jump = self._jumped(compared, around, current)
+        jump = self._jumped(compared, around, map_)
         if jump != NO_EXPERIENCE:
             return self._correct(jump, elsewhere[best], costs[here], map_)
+        if self._carried_away(around, current):
+            s.mode, s.bad, s.doubts = Mode.SEARCHES, 0, c.doubt_frames
+            self.evidence.array("cost")[:] = self.evidence.array("fresh")
+            return Tracking("wait", current, -costs[here], -elsewhere[best])
         if s.bad >= c.lost_frames:
-            s.mode, s.bad = Mode.EXPLORES, 0
+            s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
             left = Tracking("leave", current, -costs[here], -elsewhere[best])
             return left._replace(revoked=self._revoke())
         return Tracking("at", current if s.bad else here, -costs[here], -elsewhere[best])
@@ -317,24 +326,28 @@ class SequenceTracker(Mergeable):
     def _doubt(
         self,
         costs: np.ndarray,
-        relative: np.ndarray,
+        compared: np.ndarray,
         near: np.ndarray,
         around: _Around,
-        current: int,
+        map_: ExperienceMap,
     ) -> Tracking:
         """Look for the robot where it was, then on the whole map."""
-        s, c = self.state, self.config
+        s, c, current = self.state, self.config, map_.current
         s.doubts += 1
-        s.bad = s.bad + 1 if relative[near].min() < -c.keep else 0
+        s.bad = s.bad + 1 if self.closeness[near].min() < c.alike else 0
         if s.bad >= 3:  # frames in a row that show where the robot was
             return self._resume(current)
         best = int(costs.argmin())
-        rival = np.where(around(best, _APART, _APART), UNKNOWN, costs).min()
+        rival = np.where(around(best, _APART, _APART) | _beside(best, map_), UNKNOWN, costs).min()
         if self._confirmed(best, costs[best], rival, around):
             if around(current, _APART, _APART + s.doubts)[best]:
                 return self._resume(current)
             s.mode = Mode.TRACKS
             return self._go("set", best, costs[best], rival)
+        if s.mode == Mode.SEARCHES:
+            jump = self._jumped(compared, around, map_)
+            if jump != NO_EXPERIENCE:
+                return self._go(self._closing(jump, map_), jump, costs[jump], rival)
         if s.doubts > c.doubt_frames:
             s.mode = Mode.SEARCHES
         if s.doubts > c.doubt_frames + c.search_frames:
@@ -359,7 +372,7 @@ class SequenceTracker(Mergeable):
         enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
         return enough and alike <= c.alike
 
-    def _jumped(self, compared: np.ndarray, around: _Around, current: int) -> int:
+    def _jumped(self, compared: np.ndarray, around: _Around, map_: ExperienceMap) -> int:
         """Return where the robot is after a sudden change of view, or that there is no sign of one.
 
         Frames since the change fit a path elsewhere, and none near the present experience.
@@ -370,11 +383,11 @@ class SequenceTracker(Mergeable):
             return NO_EXPERIENCE
         fresh = np.where(compared, self.evidence.array("fresh"), UNKNOWN)
         best = int(fresh.argmin())
-        near = around(current, _APART, _APART + s.since_sudden // 2)
-        known = 3.0 * c.margin if self.tracks else c.margin
-        rival = np.where(around(best, _APART, _APART), UNKNOWN, fresh).min()
+        near = around(map_.current, _APART, _APART + s.since_sudden // 2)
+        known = 3.0 * c.margin if self.tracks and self._fits(near) else c.margin
+        rival = np.where(around(best, _APART, _APART) | _beside(best, map_), UNKNOWN, fresh).min()
         lead = min(fresh[near].min() - known, rival - c.margin) - fresh[best]
-        if near[best] or fresh[best] > -c.believe or lead < 0.0:
+        if near[best] or fresh[best] > -c.believe or lead < 0.0 or not self._fits(best):
             s.jumped, s.jump_frames = NO_EXPERIENCE, 0
             return NO_EXPERIENCE
         follows = s.jumped != NO_EXPERIENCE and around(s.jumped, 1, _AHEAD)[best]
@@ -384,6 +397,18 @@ class SequenceTracker(Mergeable):
         s.mode = Mode.TRACKS
         self.evidence.array("cost")[:] = self.evidence.array("fresh")
         return best
+
+    def _carried_away(self, around: _Around, current: int) -> bool:
+        """Return whether no frame since an abrupt change fits the places where the robot was."""
+        s = self.state
+        if s.doubts:
+            near = around(current, _APART, _APART + s.doubts // 2)
+            s.doubts = 0 if self._fits(near) else s.doubts + 1
+        return s.doubts > _SETTLE
+
+    def _fits(self, some: np.ndarray | int) -> bool:
+        """Return whether a frame is like one of some experiences, if not as like as a closure."""
+        return bool(self.closeness[some].min() <= 0.5 * (1.0 + self.config.alike))
 
     def _correct(self, best: int, cost: float, rival: float, map_: ExperienceMap) -> Tracking:
         """Go to another part of the map; a loop closure that led astray is revoked."""
@@ -420,16 +445,27 @@ class SequenceTracker(Mergeable):
         return Tracking(kind, experience, -float(cost), -float(rival))
 
     def _resume(self, current: int) -> Tracking:
-        """Go on as before the doubt."""
+        """Go on as before the doubt: at a known place, or exploring from a new one."""
         s = self.state
-        s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
+        known = self.evidence.array("made")[current] <= s.frames - self.config.recent_frames
+        s.mode, s.doubts = (Mode.TRACKS if known else Mode.EXPLORES), 0
         self._forget()
-        return Tracking("explore", current)
+        return Tracking("at" if known else "explore", current)
 
     def _forget(self) -> None:
         s = self.state
         self.evidence.array("cost")[:] = 0.0
         s.streak, s.candidate, s.bad = 0, NO_EXPERIENCE, 0
+
+
+def _beside(experience: int, map_: ExperienceMap) -> np.ndarray:
+    """Return which experiences lie beside one and have its heading: the same place, mapped again.
+
+    The links do not join them to it where the robot left its map for a while.
+    """
+    apart = map_.pose_table - map_.pose_table[experience]
+    close = np.hypot(apart[:, 0], apart[:, 1]) <= _BESIDE[0] * _link_length(map_)
+    return np.asarray(close & (np.cos(apart[:, 2]) >= np.cos(_BESIDE[1])))
 
 
 def _link_length(map_: ExperienceMap) -> float:

@@ -46,11 +46,11 @@ def drive(phases, wall=None, first=0, seed=1):
         yield Frame(first + i, (first + i) / 20.0, image, velocity)
 
 
-def brain(**sequence):
+def brain(**sessions):
     config = {
         "view": {"template_width": 40, "template_height": 20, "patch_radius": 2, "threshold": 0.1},
         "map": {"closure": "sequence", "loops": 10},
-        "sequence": sequence,
+        "sessions": sessions,
     }
     return NavigationBrain(BrainConfig(**config))
 
@@ -138,6 +138,40 @@ def test_a_jump_of_half_a_lap_is_noticed_and_the_robot_found(three_laps):
     last = results[-1]
     phase = made[last.experience] % LAP / LAP
     assert abs((phase - phases[-1] + 0.5) % 1 - 0.5) < 0.05
+
+
+@pytest.fixture(scope="module")
+def alert():
+    """A brain after three laps, for which another wall is an abrupt change."""
+    robot = brain(kidnapped_factor=1.3)
+    for frame in drive(laps(3)):
+        robot(frame)
+    assert robot.tracker.tracks
+    assert not robot.stored
+    return robot
+
+
+def test_a_tracked_robot_that_is_carried_to_an_unknown_place_begins_a_new_map(alert):
+    robot, first = copy.deepcopy(alert), 3 * LAP
+    for frame in drive(laps(1.0) / 3, strip(5, 7200), first):
+        robot(frame)
+    (stored,) = robot.stored
+    assert stored.map.n == alert.map.n  # nothing of the other place is on it
+    assert stored.map.n_links == alert.map.n_links
+    assert robot.sessions.now.began == "kidnapped"
+    config, began = robot.config.sequence, int(robot.map.experiences["first_frame"][0]) - first
+    assert began <= config.doubt_frames + config.search_frames + 5
+
+
+def test_a_robot_that_is_carried_off_and_back_soon_stays_on_its_map(alert):
+    robot = copy.deepcopy(alert)
+    away = list(drive(laps(0.2) / 3, strip(5, 7200), first=3 * LAP))
+    back = list(drive(laps(0.5), first=3 * LAP + len(away)))
+    for frame in away + back:
+        robot(frame)
+    assert not robot.stored
+    assert robot.map.n == alert.map.n
+    assert robot.tracker.tracks
 
 
 def test_bumps_and_blur_are_no_kidnapping(three_laps):
