@@ -418,9 +418,27 @@ class BrainState(QuickModule):
                 break
         return True
 
+    @property
+    def largest(self) -> Self:
+        """The largest map of this drive: the present one, or one that a kidnapping or gap ended.
+
+        It is the one that is drawn and written; stored maps of other drives do not count.
+        """
+        maps = [self, *self.stored]
+        before = {s.id: s.continues for one in maps for s in one.sessions.sessions}
+        drive: set[int] = set()
+        session = self.sessions.now.id if self.sessions.sessions else 0
+        while session:
+            drive.add(session)
+            session = before.get(session, 0)
+        ours = [one for one in maps if any(s.id in drive for s in one.sessions.sessions)]
+        return max(ours, key=lambda one: one.map.n, default=self)
+
     def not_joined(self) -> list[dict[str, object]]:
-        """Return for each stored map how much of it was recognised, for the report of a run."""
+        """Return for each map beside the largest how much was recognised, for a run's report."""
         tally, needed = self.recognition.tally, self.config.sessions.confirm
+        largest = self.largest
+        others = [self if one is largest else one for one in self.stored]
         return [
             {
                 "sessions": [session.name for session in one.sessions.sessions],
@@ -433,7 +451,7 @@ class BrainState(QuickModule):
                 f"the alignment; expected {needed}",
             }
             for one, alike, agreed in zip(
-                self.stored, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
+                others, tally["alike"].tolist(), tally["agreed"].tolist(), strict=True
             )
         ]
 

@@ -69,7 +69,7 @@ def read_run(out: str | Path) -> FinishedRun:
     return FinishedRun(
         out,
         plan,
-        brain,
+        brain.largest,
         frames,
         actions,
         {name: column[:rows] for name, column in trace.items()},

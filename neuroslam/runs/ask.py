@@ -48,7 +48,7 @@ class AskedMap:
                 raise RunError(f"{file}: its landmarks have names of their own; no file of words")
             self.cells = load_semantic_map(file)
             return
-        brain = load_brain(file)
+        brain = load_brain(file).largest
         self.unit = length_unit(path)
         cells = brain.populations.get("semantic")
         if not isinstance(cells, SemanticCells):

@@ -256,7 +256,7 @@ def compare_maps(
         NeuroslamError: If a brain cannot be read, or a map has too few experiences.
     """
     files = brain_file(run), brain_file(other)
-    maps = [load_brain(file).map for file in files]
+    maps = [load_brain(file).largest.map for file in files]
     ours, theirs = (each.poses[:, :2] for each in maps)
     rows = []
     modes: tuple[IcpMode, ...] = ("rigid", "similarity")

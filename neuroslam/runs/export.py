@@ -86,7 +86,7 @@ def export(
             for note in export_mcap(path, to, source):
                 on_note(note)
     else:
-        brain = load_brain(stored)
+        brain = load_brain(stored).largest
         if not brain.map.n and asked != "nir":
             raise RunError(f"{path}: its map is empty; nothing to export")
         write = partial(_WRITERS[asked], brain, to)

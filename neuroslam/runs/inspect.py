@@ -38,6 +38,7 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
     """
     file = brain_file(path)
     brain = load_brain(file)
+    present, brain = brain, brain.largest
     with safe_open(file, framework="pt") as opened:
         about = json.loads(opened.metadata()["neuroslam"])
     status, config, log = file.stat(), brain.config, brain.sessions
@@ -65,10 +66,12 @@ def inspect(path: str | Path) -> list[tuple[str, str]]:
         rows.append((f"session {session.name}", _session(session, made, own)))
     rows += [_merge(report) for report in log.merges]
     rows.append(("refused merges", str(len(log.refusals))))
-    for i, stored in enumerate(brain.stored):
-        names = ", ".join(session.name for session in stored.sessions.sessions)
-        counts = ", ".join(f"{value} {name}" for name, value in _counts(stored))
-        rows.append((f"stored map {i}, not joined", f"sessions {names}: {counts}"))
+    stored = [(f"stored map {i}", one) for i, one in enumerate(present.stored)]
+    for name, other in [("present map", present), *stored]:
+        if other is not brain:
+            names = ", ".join(session.name for session in other.sessions.sessions)
+            counts = ", ".join(f"{value} {what}" for what, value in _counts(other))
+            rows.append((f"{name}, not joined", f"sessions {names}: {counts}"))
     return rows
 
 

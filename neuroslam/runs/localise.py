@@ -75,7 +75,7 @@ def localise(
         raise RunError(f"{out}: exists; choose another name or use --overwrite")
     if start < 0 or (stop is not None and stop <= start):
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
-    brain = load_brain(path, features=features)
+    brain = load_brain(path, features=features).largest
     localiser, summary = Localiser(brain), LocaliseSummary()
     opened = open_source(source, brain.config.frame_rate_hz, brain.config.view.grey)
 

@@ -209,6 +209,7 @@ def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = Non
     brain = load_brain(brain_file(run))
     rows = brain.clock.frames_seen
     frames, actions, trace = read_frames(run, rows), read_actions(run, rows), read_trace(run, rows)
+    brain = brain.largest
     poses = trajectory(brain, trace)
     known = np.isfinite(poses).all(axis=1)
     times_s = frames["time_s"]

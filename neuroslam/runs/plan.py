@@ -51,7 +51,7 @@ def plan(
         RunError: If start or goal is neither, or no links lead from one to the other.
     """
     file = brain_file(path)
-    brain, out = load_brain(file), Path(file.parent if out is None else out)
+    brain, out = load_brain(file).largest, Path(file.parent if out is None else out)
     if not brain.map.n:
         raise RunError(f"{path}: the map has no experiences; there is nowhere to go")
     end, beside_m = _experience(brain, goal, "goal")

@@ -49,6 +49,7 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
     try:
         to.mkdir(parents=True, exist_ok=True)
         draw_map(brain, plan, trace, to / "map.png", length_unit(out))
+        brain = brain.largest
         path = trajectory(brain, trace)[:, :2]
         figures: dict[str, Figure] = {}
         for kind, population in brain.populations.items():
@@ -101,7 +102,11 @@ def draw_map(
     path: Path,
     unit: str = "m",
 ) -> None:
-    """Draw ``map.png`` of a run in the coordinates of its CSVs, one colour per session."""
+    """Draw ``map.png`` of a run in the coordinates of its CSVs, one colour per session.
+
+    Of several maps of the drive the largest is drawn.
+    """
+    present, brain = brain, brain.largest
     links, truth, log = brain.map.links, true_poses(trace), brain.sessions
     track = trajectory(brain, trace)[:, :2]
     on_map = np.isfinite(track[:, 0])
@@ -116,18 +121,18 @@ def draw_map(
         odometry_xy=odometry_track(brain.config, trace)[:, :2],
         track_xy=track[on_map],
         truth_xy=None if truth is None else truth[on_map, :2],
-        current=brain.map.pose,
+        current=brain.map.pose if brain is present else None,
         landmarks=brain.landmarks_m,
         session=made_by if several else None,
         session_names=names if several else (),
         odometry_of=whose if several else "",
-        title=_title(brain, plan, on_map),
+        title=_title(brain, plan, on_map, len(present.stored)),
         unit=unit,
     )
     save(figure, path)
 
 
-def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
+def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray, n_stored: int) -> str:
     """Return the title: source, frames, sessions, and frames on maps that were not joined."""
     n, sources = len(on_map), dict.fromkeys(s.source for s in brain.sessions.sessions)
     title = f"{plan.name}: {counted(n, 'frame')}"
@@ -136,11 +141,11 @@ def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray) -> str:
         title = f"{len(brain.sessions.sessions)} sessions on one map: {named}"
     title = textwrap.fill(plain_text(title), _TITLE_WIDTH, max_lines=3, placeholder=" …")
     apart = n - int(on_map.sum())
-    if brain.stored and apart:
+    if n_stored and apart:
         title += f"\n{apart:,} of {counted(n, 'frame')} are on maps that were not joined"
-    elif brain.stored:
-        stored = counted(len(brain.stored), "stored map")
-        title += f"\n{stored} {'was' if len(brain.stored) == 1 else 'were'} not joined"
+    elif n_stored:
+        stored = counted(n_stored, "stored map")
+        title += f"\n{stored} {'was' if n_stored == 1 else 'were'} not joined"
     return title
 
 

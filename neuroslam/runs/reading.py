@@ -135,7 +135,8 @@ def trajectory(brain: NavigationBrain, trace: dict[str, np.ndarray]) -> np.ndarr
     moved = part_of.any(axis=1)
     at[moved] = compose_poses(at[moved], part_of[moved])
     if not brain.sessions.merges:
-        at[trace["number"] < 0] = 0.0  # before the first experience
+        ours = np.isin(trace["session"], [session.id for session in brain.sessions.sessions])
+        at[ours & (trace["number"] < 0)] = 0.0  # before the first experience
     return compose_poses(at, np.column_stack([trace[n] for n in ("dx_m", "dy_m", "dtheta_rad")]))
 
 

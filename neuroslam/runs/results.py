@@ -144,7 +144,8 @@ def write_results(
     """
     save.rows()  # flushes them
     trace = read_trace(save.rows_in, min_rows=0)
-    track = trajectory(brain, trace)
+    shown = brain.largest
+    track = trajectory(shown, trace)
     truth = true_poses(trace)
     odometry = odometry_track(brain.config, trace)
     on_map = np.isfinite(track[:, 0])
@@ -156,15 +157,15 @@ def write_results(
     summary.not_joined = brain.not_joined()
     summary.frames = brain.clock.frames_seen
     summary.counts = {
-        "templates": brain.view.n,
-        "experiences": brain.map.n,
-        "links": brain.map.n_links,
-        "loop_closures": int(closes_loop(*brain.map.links[:2]).sum()),
+        "templates": shown.view.n,
+        "experiences": shown.map.n,
+        "links": shown.map.n_links,
+        "loop_closures": int(closes_loop(*shown.map.links[:2]).sum()),
     }
-    summary.counts |= gathered(brain.populations.values(), counts_of)
+    summary.counts |= gathered(shown.populations.values(), counts_of)
     if summary.measured:
         summary.warnings = unit_warnings(trace, is_animal(plan.source, brain.config))
-    tables = gathered(brain.populations.values(), tables_of)
+    tables = gathered(shown.populations.values(), tables_of)
     summary.tables = list(tables)
     if truth is not None:
         known = on_map & np.isfinite(truth[:, 0])
@@ -182,8 +183,8 @@ def write_results(
                 ).rmse
             summary.accuracy["frames_with_truth"] = int(known.sum())
     staged = save.folder.staged
-    write_text(staged / "experiences.csv", experiences_csv(brain))
-    write_text(staged / "links.csv", links_csv(brain.map.links, brain.map.link_weights))
+    write_text(staged / "experiences.csv", experiences_csv(shown))
+    write_text(staged / "links.csv", links_csv(shown.map.links, shown.map.link_weights))
     for name, table in tables.items():
         write_text(staged / name, table)
     write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))

@@ -68,13 +68,14 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
             read(out)
         except NeuroslamError as error:
             yield str(error)
+    shown = brain.largest
     expected = {
-        "experiences.csv": experiences_csv(brain),
-        "links.csv": links_csv(brain.map.links, brain.map.link_weights),
+        "experiences.csv": experiences_csv(shown),
+        "links.csv": links_csv(shown.map.links, shown.map.link_weights),
     }
-    if _header(out / "links.csv") == links_csv(brain.map.links).splitlines()[0]:
-        expected["links.csv"] = links_csv(brain.map.links)  # of a version without weights
-    expected |= gathered(brain.populations.values(), tables_of)
+    if _header(out / "links.csv") == links_csv(shown.map.links).splitlines()[0]:
+        expected["links.csv"] = links_csv(shown.map.links)  # of a version without weights
+    expected |= gathered(shown.populations.values(), tables_of)
     for name, text in expected.items():
         fault = _table_fault(out / name, text)
         if fault:
@@ -95,7 +96,7 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
             f"{counted(seen, 'frame')}; the run was cut off: resume it"
         )
     try:
-        poses = trajectory(brain, read_trace(out, seen))
+        poses = trajectory(shown, read_trace(out, seen))
         on_map = np.isfinite(poses[:, 0])
         if not on_map.any():
             return  # all frames are on maps that were not joined
