@@ -1,7 +1,9 @@
 """Run the benchmarks and print one table: ``python -m benchmarks.table``.
 
 ``--write`` keeps it in ``benchmarks/last.json``; ``--check`` fails if a row takes 15 % longer, in
-Y, than there. ``--only NAME`` runs the modules whose names contain NAME.
+Y, than there. ``--only NAME`` runs the modules whose names contain NAME, and ``--only NAME:TEXT``
+keeps of them the rows whose step and size contain TEXT. Rows that were not measured stay in
+``last.json`` as they are.
 """
 
 import argparse
@@ -38,12 +40,15 @@ def machine() -> str:
 def measured(only: str) -> dict[str, tuple[float, Row]]:
     """Run the modules: step and size -> time in Y, and the row."""
     found = {}
+    wanted, _, text = only.partition(":")
     for name in MODULES:
-        if only in name:
+        if wanted in name:
             y = yardstick_ms()
             for row in import_module(f"benchmarks.bench_{name}").rows():
-                found[f"{row.step} | {row.size}"] = row.ms / y, row
+                title = f"{row.step} | {row.size}"
                 print(f"  {row.step}, {row.size}: {written(row.ms)}", file=sys.stderr)
+                if text in title:
+                    found[title] = row.ms / y, row
     return found
 
 

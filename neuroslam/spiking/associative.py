@@ -1,7 +1,5 @@
 """The semantic map: an associative memory in neurons from landmarks to positions."""
 
-from typing import cast
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +7,7 @@ from torch import Tensor
 from neuroslam.config.semantic import NeuronConfig, SemanticMapConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
+    Stepper,
     lowpass,
     rates,
     replace,
@@ -17,7 +16,7 @@ from neuroslam.spiking.ensemble import (
     synapse,
     view,
 )
-from neuroslam.spiking.learning import memorise, pes_step, voja_step
+from neuroslam.spiking.learning import drive_by_keys, memorise, pes_step, voja_step
 from neuroslam.state.mergeable import BufferModule
 
 _SOLVER_POINTS = 3000
@@ -172,36 +171,63 @@ class AssociativeMap(BufferModule):
         voja: np.ndarray,
     ) -> np.ndarray:
         """Step as :meth:`forward` does, compiled; arguments are its own."""
-        modules = self._modules
-        memory, error = (cast(NeuronArray, modules[name]) for name in ("memory", "error"))
-        encoders, recalled = view(self, "encoders"), view(self, "recalled")
-        rates = self._rates
-        if rates is None or rates.dtype != recalled.dtype:
-            rates = self._rates = self._constants(recalled.dtype)
-        # A large product: that of torch is quicker than a loop, and adds in an order of its own.
-        weights = cast(Tensor, self._buffers["encoders"])
-        said = torch.bmm(torch.from_numpy(key).unsqueeze(1), weights.mT).squeeze(1).numpy()
-        drive = rates[6] * (rates[7] - view(memory, "bias") - said)
-        spikes = memory.fire_compiled(drive[None])[0]
-        relayed, taught, rule = (view(self, n) for n in ("relayed", "taught", "rule"))
-        silenced = rates[8] * (rates[7] - seen)
-        error_decoders = view(self, "error_decoders")
-        error_now = error.respond((relayed - taught)[None], error_decoders, silenced)[0]
-        passed = recalled
-        if self.config.relay:
-            passed = self.relay.respond(passed[None], view(self, "relay_decoders"))[0]
-        after = tuple(np.empty_like(rule) for _ in range(4))
-        memorise(
-            spikes, key, plasticity, voja, view(self, "gain"), encoders, view(self, "decoders"),
-            view(self, "activity_hz"), (rule, recalled, relayed, taught),
-            (error_now, passed, value), rates, (*after, np.empty_like(rule[0])),
-        )  # fmt: skip
-        rule, recalled, relayed, taught = after
-        replace(self, rule=rule, recalled=recalled, relayed=relayed, taught=taught)
+        step, keep = self.stepper()
+        recalled = step(key, value, seen, plasticity, voja, np.zeros(len(key), dtype=np.bool_))
+        keep()
         return recalled
 
+    def stepper(self) -> Stepper:
+        """Return a function that steps as :meth:`advance` does, and one that keeps the state.
+
+        The first takes one argument more: whether an animal's key is that of the step before,
+        ``(batch,)``; not so in the first step. Its array is changed by the step after the next.
+        """
+        memory, error = self.memory, self.error
+        names = "rule", "relayed", "taught", "recalled"
+        rule, relayed, taught, recalled = (view(self, name).copy() for name in names)
+        encoders, decoders, gain = (view(self, n) for n in ("encoders", "decoders", "gain"))
+        activity, bias = view(self, "activity_hz"), view(memory, "bias")
+        rates = self._rates
+        if rates is None or rates.dtype != rule.dtype:
+            rates = self._rates = self._constants(rule.dtype)
+        spare, wrong = np.empty_like(rule), np.empty_like(rule[0])
+        drive = np.zeros((1, *activity.shape), dtype=rule.dtype)
+        said, spikes = np.zeros_like(activity), np.zeros_like(activity)
+        answer = error.responder(view(self, "error_decoders"))
+        pass_on = None
+        if self.config.relay:
+            pass_on = self.relay.responder(view(self, "relay_decoders"))
+        drive_, memorise_ = drive_by_keys.dispatcher(), memorise.dispatcher()
+        one, silence = rates[7], rates[8]
+
+        def step(
+            key: np.ndarray,
+            value: np.ndarray,
+            seen: np.ndarray,
+            plasticity: np.ndarray,
+            voja: np.ndarray,
+            same: np.ndarray,
+        ) -> np.ndarray:
+            nonlocal recalled, spare, spikes
+            drive_(key, encoders, bias[0], spikes, same, rates, said, drive[0])
+            spikes = memory.fire_compiled(drive)[0]
+            error_now = answer((relayed - taught)[None], silence * (one - seen))[0]
+            passed = recalled if pass_on is None else pass_on(recalled[None], None)[0]
+            memorise_(
+                spikes, key, plasticity, voja, gain, encoders, decoders, activity,
+                (rule, recalled, relayed, taught), (error_now, passed, value), rates,
+                (rule, spare, relayed, taught, wrong),
+            )  # fmt: skip
+            recalled, spare = spare, recalled
+            return recalled
+
+        def keep() -> None:
+            replace(self, rule=rule, recalled=recalled, relayed=relayed, taught=taught)
+
+        return step, keep
+
     def _constants(self, kind: np.dtype) -> np.ndarray:
-        """Return the rates of ``memorise``, and those of the drive."""
+        """Return the rates of ``memorise``, and those of the drive; the last is 0."""
         c, dt = self.config, self.time_step_s
         numbers = [
             1.0 / dt,
@@ -211,6 +237,7 @@ class AssociativeMap(BufferModule):
             self.memory.charged,
             1.0,
             self.error.charged * _INHIBITION,
+            0.0,
         ]
         return np.array(numbers, dtype=kind)
 

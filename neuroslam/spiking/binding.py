@@ -10,6 +10,7 @@ from neuroslam.compiled import compiled
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
+    Stepper,
     lowpass,
     replace,
     sample_tuning,
@@ -106,15 +107,28 @@ class SpikingBinding(BufferModule):
 
     def advance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
-        decoders = view(self, "decoders").reshape(8 * a.shape[1], -1, 1)
-        x = np.empty((len(decoders), len(a), 1), dtype=a.dtype)
-        sums_and_differences(a, b, x)
-        squares = self.neurons.respond(x, decoders)
-        before, kept = view(self, "product"), synapse(TAU_S, self.time_step_s)
-        product = np.empty_like(before)
-        products_of(squares, before, kept, product)
-        replace(self, product=product)
+        step, keep = self.stepper()
+        product = step(a, b)
+        keep()
         return product
+
+    def stepper(self) -> Stepper:
+        """Return a function that steps as :meth:`advance` does, and one that keeps the state.
+
+        The array that the first returns is changed by its next call.
+        """
+        product, kept = view(self, "product").copy(), synapse(TAU_S, self.time_step_s)
+        batch, n = product.shape[:2]
+        answer = self.neurons.responder(view(self, "decoders").reshape(8 * n, -1, 1))
+        x = np.empty((8 * n, batch, 1), dtype=product.dtype)
+        before, after = sums_and_differences.dispatcher(), products_of.dispatcher()
+
+        def step(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+            before(a, b, x)
+            after(answer(x, None), product, kept, product)
+            return product
+
+        return step, lambda: replace(self, product=product)
 
 
 @compiled

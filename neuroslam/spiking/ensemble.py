@@ -1,7 +1,9 @@
 """Populations of neurons that represent vectors: tuning, decoders, synapses (NEF)."""
 
 import math
-from typing import NamedTuple, cast
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -23,6 +25,10 @@ from neuroslam.spiking.neurons import (
 )
 from neuroslam.spiking.rounding import rounded
 from neuroslam.state.mergeable import BufferModule
+
+Stepper = tuple[Callable[..., np.ndarray], Callable[[], None]]
+"""A function that advances a part of a network by a step, on copies of its buffers, and one that
+sets the buffers to them: for many steps, in which only numbers change."""
 
 
 class Tuning(NamedTuple):
@@ -152,6 +158,24 @@ class _Views(dict[str, tuple[Tensor, np.ndarray]]):
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
         return _Views, ()
+
+
+class Remembered:
+    """What a module looks up once for its compiled steps; a copy of the module does so again."""
+
+    def __init__(self) -> None:
+        self.of: tuple[object, ...] = ()
+        self.value: Any = None
+
+    def holds(self, of: tuple[object, ...]) -> bool:
+        """Return whether the value was made of these very objects."""
+        return len(of) == len(self.of) and all(map(operator.is_, self.of, of))
+
+    def __deepcopy__(self, memo: object) -> "Remembered":
+        return Remembered()
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return Remembered, ()
 
 
 def view(module: BufferModule, name: str) -> np.ndarray:
@@ -377,13 +401,36 @@ class NeuronArray(BufferModule):
             drive = torch.from_numpy(folded.rest).unsqueeze(1) + more_t
             drive = torch.baddbmm(drive, torch.from_numpy(x), torch.from_numpy(folded.slopes))
             return torch.bmm(self.fire(drive), torch.from_numpy(decoders)).numpy()
-        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        asleep, spikes = view(self, "asleep"), self._spikes()
         decoded = np.empty((groups, batch, decoders.shape[2]), dtype=deficit.dtype)
         respond(
             x, added, folded.slopes, folded.rest, deficit, asleep, spikes, decoders, folded.lif,
             decoded,
         )  # fmt: skip
         return decoded
+
+    def responder(
+        self, decoders: np.ndarray
+    ) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
+        """Return :meth:`respond` for many steps, until a buffer of the neurons is replaced.
+
+        What does not change from step to step is looked up once.
+        """
+        if self._has_rates:
+            return lambda x, more: self.respond(x, decoders, more)
+        folded, deficit, asleep = self._constants(), view(self, "deficit"), view(self, "asleep")
+        spikes, step = self._spikes(), respond.dispatcher()
+        slopes, rest, lif = folded.slopes, folded.rest, folded.lif
+        nothing = np.zeros(deficit.shape[1], dtype=deficit.dtype)
+        shape, kind = (*deficit.shape[:2], decoders.shape[2]), deficit.dtype
+
+        def responded(x: np.ndarray, more: np.ndarray | None) -> np.ndarray:
+            decoded = np.empty(shape, kind)
+            added = nothing if more is None else more
+            step(x, added, slopes, rest, deficit, asleep, spikes, decoders, lif, decoded)
+            return decoded
+
+        return responded
 
     def fire_compiled(self, drive: np.ndarray) -> np.ndarray:
         """Step as :meth:`fire` does, in one compiled pass."""
@@ -392,18 +439,22 @@ class NeuronArray(BufferModule):
             raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
         if self._has_rates:
             return self.fire(torch.from_numpy(drive)).numpy()
-        asleep, spikes = view(self, "asleep"), self._spikes(deficit)
+        asleep, spikes = view(self, "asleep"), self._spikes()
         rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
         now, owing, paused, fired = rows
         fire_row(now, owing, paused, fired, self._constants().lif)
         return spikes
 
-    def _spikes(self, deficit: np.ndarray) -> np.ndarray:
-        spikes = view(self, "spikes")
+    def _spikes(self) -> np.ndarray:
+        deficit, spikes = view(self, "deficit"), view(self, "spikes")
         if spikes.shape != deficit.shape or spikes.dtype != deficit.dtype:
             replace(self, spikes=np.zeros_like(deficit))  # of a state that was put in
             spikes = view(self, "spikes")
         return spikes
+
+    def given(self) -> tuple[object, ...]:
+        """Return the objects that :meth:`responder` takes: others if a buffer was replaced."""
+        return self._constants(), view(self, "deficit"), view(self, "asleep"), self._spikes()
 
     def _constants(self) -> "_Folded":
         """Return what follows from weights and biases; renewed with them."""

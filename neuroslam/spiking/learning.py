@@ -52,6 +52,51 @@ def voja_step(encoders: Tensor, gain: Tensor, spikes: Tensor, key: Tensor, rate:
 
 
 @compiled
+def drive_by_keys(
+    key: np.ndarray,
+    encoders: np.ndarray,
+    bias: np.ndarray,
+    spikes: np.ndarray,
+    same: np.ndarray,
+    rates: np.ndarray,
+    said: np.ndarray,
+    drive: np.ndarray,
+) -> None:
+    """Encode keys; ``AssociativeMap.forward`` is the definition.
+
+    If a key is that of the step before, only encoders of neurons that fired in it have moved.
+
+    Args:
+        key: ``(batch, n_key)``.
+        encoders: ``(batch, neurons, n_key)``.
+        bias: ``(neurons,)``.
+        spikes: In the step before, ``(batch, neurons)``.
+        same: Whether the key is that of the step before, ``(batch,)``.
+        rates: See ``AssociativeMap._constants``.
+        said: Products of encoders and keys, ``(batch, neurons)``; changed.
+        drive: See ``NeuronArray.fire``, ``(batch, neurons)``; written.
+    """
+    batch, neurons, n = encoders.shape
+    share, one, none = rates[6], rates[7], rates[9]
+    for b in range(batch):
+        for i in range(neurons):
+            if same[b] and spikes[b, i] == none:
+                continue
+            row, name = encoders[b, i], key[b]
+            first = second = third = fourth = none
+            for j in range(n // 4):
+                first += row[4 * j] * name[4 * j]
+                second += row[4 * j + 1] * name[4 * j + 1]
+                third += row[4 * j + 2] * name[4 * j + 2]
+                fourth += row[4 * j + 3] * name[4 * j + 3]
+            for j in range(n - n % 4, n):
+                first += row[j] * name[j]
+            said[b, i] = (first + second) + (third + fourth)
+        for i in range(neurons):
+            drive[b, i] = share * (one - bias[i] - said[b, i])
+
+
+@compiled
 def memorise(
     spikes: np.ndarray,
     key: np.ndarray,

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -13,6 +14,7 @@ from neuroslam.errors import SpaceError
 from neuroslam.spiking.decoding import PositionDecoder
 from neuroslam.spiking.ensemble import (
     NeuronArray,
+    Remembered,
     lowpass,
     may_share,
     replace,
@@ -25,6 +27,7 @@ from neuroslam.spiking.space import SSPSpace
 from neuroslam.spiking.vector_steps import (
     CLEARLY_BETTER,
     COUPLINGS,
+    SpaceTables,
     couple,
     oscillators_after,
     oscillators_before,
@@ -38,7 +41,11 @@ _SOLVER_POINTS = 2500
 _RADIUS = math.sqrt(2.0)  # of what an oscillator represents: a point of a circle, and a rate
 _LOOK_S = 0.004  # time between two decodings of the position
 REREAD_STEPS = 100  # steps between two decodings over the whole space
+_STATE = ("output", "recurrent", "external", "position_m", "age")  # of compiled steps
 _VELOCITY_SEED = 8  # added to the seed; smaller ones are of other parts of SSP-SLAM
+
+Steps = Callable[[np.ndarray, np.ndarray | None], tuple[np.ndarray, np.ndarray]]
+"""Advances by a velocity and a pull; returns coefficients and positions."""
 
 
 def oscillator_dynamics(point: Tensor, frequency: Tensor, tau_s: float, stabilise: float) -> Tensor:
@@ -179,15 +186,14 @@ class BasePathIntegrator(BufferModule, ABC):
         self.position_m, self.age = position, self.age + 1
         return z
 
-    def locate_compiled(self, z: np.ndarray, position: np.ndarray) -> None:
-        """Count a step, and track positions in place as :meth:`locate` does.
+    def _look(self, z: np.ndarray, position: np.ndarray, age: int) -> None:
+        """Decode positions in place, where :meth:`locate` does in a step of this age.
 
         Args:
             z: ``(batch, n_frequencies, 2)``.
             position: Integrated, ``(batch, dimension)``.
+            age: Steps since the start, with this one.
         """
-        age = int(view(self, "age")) + 1
-        replace(self, age=np.array(age))
         if age % self.look_steps == 0:
             tables = self.decoder.tables()
             for mine, x in zip(z, position, strict=True):
@@ -256,7 +262,7 @@ class PathIntegrator(BasePathIntegrator):
         super().__init__(space, config, time_step_s, batch)
         draw = torch.Generator().manual_seed(seed)
         k = space.n_frequencies
-        self._walk: np.ndarray | None = None  # constants of compiled steps
+        self._steps = Remembered()
         tuning = sample_tuning(k, config.neurons, 3, neurons, draw, radius=_RADIUS)
         self.neurons = NeuronArray(tuning, neurons, time_step_s, draw, batch)
         for name in ("recurrent", "external", "output"):
@@ -364,38 +370,78 @@ class PathIntegrator(BasePathIntegrator):
         Returns:
             ``(batch, n_frequencies, 2)``.
         """
-        output, recurrent, external = (view(self, n) for n in ("output", "recurrent", "external"))
-        position, walk = view(self, "position_m"), self._walk
-        if pull is None:
-            pull = np.zeros((len(position), len(output), 2), dtype=output.dtype)
-        if walk is None or walk.dtype != output.dtype:
-            c, dt = self.config, self.time_step_s
-            kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
-            walk = self._walk = np.array([c.coupling_gain, *kept, dt], dtype=output.dtype)
-        if self.velocity is not None:
-            velocity = self.velocity.advance(velocity)
-        tables, fastest = self.decoder.tables(), view(self, "fastest_rad_s")
-        n, batch, _ = output.shape
-        x = np.empty((n, batch, 3), dtype=output.dtype)
-        z = np.empty((batch, n, 2), dtype=output.dtype)
-        later, again, read = (np.empty_like(output) for _ in range(3))
-        if self.coupling == COUPLINGS.index("modules"):
-            pull = pull.copy()
-            for b, inner in enumerate(pull):
-                held = np.ascontiguousarray(output[:, b])
-                couple(tables.modules, held, held, self.coupling, walk[0], inner)
-        manifold = self.coupling == COUPLINGS.index("manifold")
-        oscillators_before(
-            tables.waves, output, recurrent, external, fastest, position, velocity, pull, manifold,
-            walk, x, later,
-        )  # fmt: skip
-        neurons = cast(NeuronArray, self._modules["neurons"])
-        decoded = neurons.respond(x, view(self, "decoders"))
-        oscillators_after(decoded, recurrent, output, walk, again, read, z)
-        position = position + walk[4] * velocity
-        self.locate_compiled(z, position)
-        replace(self, external=later, recurrent=again, output=read, position_m=position)
+        step, keep = self.stepper()
+        z, _ = step(velocity, pull)
+        keep()
         return z
+
+    def stepper(self) -> tuple[Steps, Callable[[], None]]:
+        """Return a function that steps as :meth:`advance` does, and one that keeps the state.
+
+        The first returns the coefficients and the positions; its next call changes the latter.
+        """
+        state = tuple(view(self, name) for name in _STATE)
+        neurons, tables = cast(NeuronArray, self._modules["neurons"]), self.decoder.tables()
+        of = (
+            self.config, tables, view(self, "fastest_rad_s"), view(self, "decoders"),
+            state[0].shape, state[0].dtype, *neurons.given(),
+        )  # fmt: skip
+        steps = self._steps
+        if not steps.holds(of):
+            steps.of, steps.value = of, self._stepper(tables)
+        step, keep, mine = steps.value
+        for ours, theirs in zip(mine, state, strict=True):
+            ours[...] = theirs
+        return step, keep
+
+    def _stepper(
+        self, tables: SpaceTables
+    ) -> tuple[Steps, Callable[[], None], tuple[np.ndarray, ...]]:
+        """Make the functions of :meth:`stepper`, and the state that they advance."""
+        mine = tuple(np.empty_like(view(self, name)) for name in _STATE)
+        output, recurrent, external, position, age = mine
+        fastest, decoders = view(self, "fastest_rad_s"), view(self, "decoders")
+        neurons = cast(NeuronArray, self._modules["neurons"])
+        kind, (n, batch, _) = output.dtype, output.shape
+        c, dt = self.config, self.time_step_s
+        kept = (synapse(tau, dt) for tau in (c.input_tau_s, c.tau_s, c.output_tau_s))
+        walk = np.array([c.coupling_gain, *kept, dt], dtype=kind)
+        modules = self.coupling == COUPLINGS.index("modules")
+        manifold = self.coupling == COUPLINGS.index("manifold")
+        before, after = oscillators_before.dispatcher(), oscillators_after.dispatcher()
+        answer, hear = neurons.responder(decoders), self.velocity
+        x, nothing = np.empty((n, batch, 3), kind), np.zeros((batch, n, 2), kind)
+        waves, look = tables.waves, self.look_steps
+
+        def step(velocity: np.ndarray, pull: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+            if hear is not None:
+                velocity = hear.advance(velocity)
+            pull = nothing if pull is None else pull
+            if modules:
+                pull = pull.copy()
+                for b, inner in enumerate(pull):
+                    held = np.ascontiguousarray(output[:, b])
+                    couple(tables.modules, held, held, self.coupling, walk[0], inner)
+            before(
+                waves, output, recurrent, external, fastest, position, velocity, pull, manifold,
+                walk, x, external,
+            )  # fmt: skip
+            z = np.empty((batch, n, 2), kind)
+            after(answer(x, None), recurrent, output, walk, recurrent, output, z)
+            np.add(position, walk[4] * velocity, out=position)
+            now = int(age) + 1
+            age[...] = now
+            if now % look == 0 or now % REREAD_STEPS == 0:
+                self._look(z, position, now)
+            return z, position
+
+        def keep() -> None:
+            replace(
+                self, output=output.copy(), recurrent=recurrent.copy(), external=external.copy(),
+                position_m=position.copy(), age=age.copy(),
+            )  # fmt: skip
+
+        return step, keep, mine
 
     def drive(self, share: Tensor, pull: Tensor | None) -> None:
         """Advance the oscillators one step, in terms of their phases.

@@ -9,6 +9,8 @@ from torch import Tensor
 from neuroslam.config.semantic import NeuronConfig
 from neuroslam.spiking.ensemble import (
     NeuronArray,
+    Stepper,
+    filter_into,
     filtered,
     lowpass,
     may_share,
@@ -155,11 +157,26 @@ class VectorPopulation(BufferModule):
 
     def advance(self, z: np.ndarray) -> np.ndarray:
         """Step as :meth:`forward` does, compiled; arrays ``(batch, n_frequencies, 2)``."""
-        x = z.reshape(1, len(z), -1)
-        said = self.neurons.respond(x, view(self, "decoders")[None]).reshape(z.shape)
-        decoded = filtered(view(self, "decoded"), said, synapse(TAU_S, self.time_step_s))
-        replace(self, decoded=decoded)
+        step, keep = self.stepper()
+        decoded = step(z)
+        keep()
         return decoded
+
+    def stepper(self) -> Stepper:
+        """Return a function that steps as :meth:`advance` does, and one that keeps the state.
+
+        The array that the first returns is changed by its next call.
+        """
+        answer = self.neurons.responder(view(self, "decoders")[None])
+        decoded, kept = view(self, "decoded").copy(), synapse(TAU_S, self.time_step_s)
+        flat, filter_ = decoded.reshape(-1), filter_into.dispatcher()
+
+        def step(z: np.ndarray) -> np.ndarray:
+            said = answer(z.reshape(1, len(z), -1), None)
+            filter_(flat, said.reshape(-1), kept, flat)
+            return decoded
+
+        return step, lambda: replace(self, decoded=decoded)
 
 
 class VelocityPopulation(BufferModule):

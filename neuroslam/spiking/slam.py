@@ -1,7 +1,7 @@
 """SSP-SLAM: path integration by oscillators, corrected by an associative map of landmarks."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from neuroslam.spiking.attention import NOTHING, SEVERAL, Sight, attend, held, r
 from neuroslam.spiking.binding import TAU_S as TAU_BINDING_S
 from neuroslam.spiking.binding import SpikingBinding
 from neuroslam.spiking.correction import SpikingCorrection
-from neuroslam.spiking.ensemble import filtered, lowpass, replace, synapse, view
+from neuroslam.spiking.ensemble import filter_into, lowpass, replace, synapse, view
 from neuroslam.spiking.gaussian import (
     Gaussian,
     fit_gaussian,
@@ -34,12 +34,11 @@ from neuroslam.spiking.vector_steps import (
     Sights,
     VectorState,
     advance,
-    after_recall,
-    before_recall,
-    encode,
+    after_recalls,
+    before_recalls,
+    encode_each,
+    fourier_of_recalls,
     times,
-    to_features,
-    to_fourier,
 )
 from neuroslam.spiking.view_inputs import boxes_of, cut, with_time
 from neuroslam.state.mergeable import BufferModule
@@ -336,10 +335,12 @@ class SSPSLAM(BufferModule):
         )
         seen = (sight.attended != NOTHING).numpy()
         model, flags = self._gate_constants(v.dtype)
-        found = [
-            self._compiled_step(v[k], key[k], vector[k], held_s[k], seen[k], model, flags)
-            for k in range(len(v))
-        ]
+        step, keep = self._neuron_stepper(model, flags)
+        # Whether an animal attends to the landmark of the step before.
+        same = np.zeros(seen.shape, dtype=np.bool_)
+        same[1:] = (key[1:] == key[:-1]).all(-1)
+        found = [step(v[k], key[k], same[k], vector[k], held_s[k], seen[k]) for k in range(len(v))]
+        keep()
         self._count(sight)
         position, z, says = (torch.from_numpy(np.stack(each)) for each in zip(*found, strict=True))
         return _steps_of(position, z, says, sight.attended)
@@ -434,66 +435,102 @@ class SSPSLAM(BufferModule):
         self.time_s = torch.full_like(self.time_s, time)
         self.attended, self.held_s = sight.attended[-1].clone(), sight.held_s[-1].clone()
 
-    def _compiled_step(
-        self,
-        velocity: np.ndarray,
-        key: np.ndarray,
-        vector: np.ndarray,
-        held_s: np.ndarray,
-        seen: np.ndarray,
-        model: np.ndarray,
-        flags: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Advance neurons one step; return position, coefficients, and what ``SSPStep`` says."""
-        walk, memory = cast(PathIntegrator, self.integrator), cast(AssociativeMap, self.map)
-        tables, each = walk.decoder.tables(), range(self.batch)
-        even, odd = tables.even, tables.odd
-        z = walk.advance(velocity, view(self, "pull"))
-        position = view(walk, "position_m")
-        here, recalled = np.empty_like(z), np.empty_like(z)
-        for b in each:
-            encode(tables.waves, position[b], here[b])
-        sees = seen.astype(here.dtype)
-        if self.grid is not None:
-            here = self.grid.advance(here)
-        if self.vectors is not None:
-            vector = self.vectors.advance(vector) * sees[:, None, None]
-            here = self._late_array("here", here, TAU_VECTOR_S)
-        bind = self.binding
-        place = _product(here, vector) if bind is None else bind.advance(here, vector)
-        contradicted, familiar = (view(self, n).copy() for n in ("contradicted_s", "familiar"))
-        value = np.empty((self.batch, even.shape[1]), dtype=here.dtype)
-        now = np.empty((self.batch, 5), dtype=here.dtype)
-        before = view(self, "recalled")
-        for b in each:
-            to_features(even, odd, place[b], value[b])
-            before_recall(before[b], held_s[b], contradicted[b], seen[b], model, flags, now[b])
-        recall = memory.advance(key, value, sees, now[:, 4].copy(), sees)
-        for b in each:
-            to_fourier(even, odd, recall[b], recalled[b])
-        if self.places is not None:
-            places = cast(AssociativeMap, self.places)
-            places.advance(value * sees[:, None], key, sees, now[:, 3].copy(), sees)
-        back = vector * np.array([1.0, -1.0], dtype=vector.dtype)
-        if self.unbinding is None:
-            implied = _product(recalled, back)
-        else:
-            implied = self.unbinding.advance(recalled, back)
-            here = self._late_array("there", here, TAU_BINDING_S)
-        pull, said = np.empty_like(here), np.empty((self.batch, 3), dtype=here.dtype)
-        for b in each:
-            after_recall(
-                implied[b], here[b], seen[b], familiar[b : b + 1], contradicted[b : b + 1], now[b],
-                model, bool(flags[1]), said[b], pull[b],
-            )  # fmt: skip
-        replace(self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted)
-        return position, z, np.stack([now[:, 0], said[:, 0], said[:, 1], now[:, 1]], axis=-1)
+    def _neuron_stepper(
+        self, model: np.ndarray, flags: np.ndarray
+    ) -> tuple[Callable[..., tuple[np.ndarray, ...]], Callable[[], None]]:
+        """Return a function that advances neurons a step, and one that keeps the state.
 
-    def _late_array(self, name: str, z: np.ndarray, tau_s: float) -> np.ndarray:
-        """Delay as :meth:`_late` does."""
-        late = filtered(view(self, name), z, synapse(tau_s, self.config.time_step_s))
-        replace(self, **{name: late})
-        return late
+        The first takes velocity, key, whether that is the key of the step before, vector, for how
+        long a landmark has been attended to, and whether one is; all lead with ``(batch,)``. It
+        returns position, coefficients, and what ``SSPStep`` says.
+        """
+        walk, memory = cast(PathIntegrator, self.integrator), cast(AssociativeMap, self.map)
+        places, vectors, grid = cast(AssociativeMap | None, self.places), self.vectors, self.grid
+        keeps = []
+
+        def stepper(part: Any) -> Any:  # noqa: ANN401 - each takes arguments of its own
+            if part is None:
+                return None
+            step, keep = part.stepper()
+            keeps.append(keep)
+            return step
+
+        integrate, recall_of, learn_place = map(stepper, (walk, memory, places))
+        see, fire_grid, bind, unbind = map(stepper, (vectors, grid, self.binding, self.unbinding))
+        recalled, pull, familiar, contradicted, late, later = (
+            view(self, name).copy()
+            for name in ("recalled", "pull", "familiar", "contradicted_s", "here", "there")
+        )
+        tables = walk.decoder.tables()
+        waves, even, odd = tables.waves, tables.even, tables.odd
+        kind, dt = pull.dtype, self.config.time_step_s
+        seen_late, bound_late = synapse(TAU_VECTOR_S, dt), synapse(TAU_BINDING_S, dt)
+        encoded, back, product, value = (
+            np.empty_like(pull), np.empty_like(pull), np.empty_like(pull),
+            np.empty((self.batch, even.shape[1]), dtype=kind),
+        )  # fmt: skip
+        now = np.empty((self.batch, 5), dtype=kind)
+        learns, plasticity = (np.empty(self.batch, dtype=kind) for _ in range(2))
+        encode_, before, between, after, multiply, filter_ = (
+            each.dispatcher()
+            for each in (
+                encode_each, before_recalls, fourier_of_recalls, after_recalls, times,
+                filter_into,
+            )
+        )  # fmt: skip
+
+        def step(
+            velocity: np.ndarray,
+            key: np.ndarray,
+            same: np.ndarray,
+            vector: np.ndarray,
+            held_s: np.ndarray,
+            seen: np.ndarray,
+        ) -> tuple[np.ndarray, ...]:
+            z, at = integrate(velocity, pull)
+            position, here, sees = at.copy(), encoded, seen.astype(kind)
+            encode_(waves, at, here)
+            if fire_grid is not None:
+                here = fire_grid(here)
+            if see is not None:
+                vector = see(vector) * sees[:, None, None]
+                filter_(late.reshape(-1), here.reshape(-1), seen_late, late.reshape(-1))
+                here = late
+            if bind is None:
+                place = product
+                multiply(here, vector, place)
+            else:
+                place = bind(here, vector)
+            before(
+                even, odd, place, recalled, held_s, contradicted, seen, model, flags, value, now,
+                learns, plasticity,
+            )  # fmt: skip
+            recall = recall_of(key, value, sees, plasticity, sees, same)
+            between(even, odd, recall, vector, recalled, back)
+            if learn_place is not None:
+                learn_place(value * sees[:, None], key, sees, learns, sees, never_same)
+            if unbind is None:
+                implied = product
+                multiply(recalled, back, implied)
+            else:
+                implied = unbind(recalled, back)
+                filter_(later.reshape(-1), here.reshape(-1), bound_late, later.reshape(-1))
+                here = later
+            says = np.empty((len(now), 4), dtype=kind)
+            after(implied, here, seen, familiar, contradicted, now, model, flags, pull, says)
+            return position, z, says
+
+        never_same = np.zeros(self.batch, dtype=np.bool_)
+
+        def keep() -> None:
+            for each in keeps:
+                each()
+            replace(
+                self, recalled=recalled, pull=pull, familiar=familiar, contradicted_s=contradicted,
+                here=late, there=later,
+            )  # fmt: skip
+
+        return step, keep
 
     def _step(
         self,
@@ -749,12 +786,6 @@ def _steps_of(position: Tensor, z: Tensor, says: Tensor, attended: Tensor) -> SS
     return SSPStep(
         position, torch.view_as_complex(z), strength, agreement, gate, lost != 0, attended
     )
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    product = np.empty_like(a)
-    times(a, b, product)
-    return product
 
 
 def _checked_names(names: Sequence[str], n: int) -> tuple[str, ...]:

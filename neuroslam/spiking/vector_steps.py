@@ -599,3 +599,75 @@ def times(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> None:
         for k in range(a.shape[1]):
             product[i, k, 0] = a[i, k, 0] * b[i, k, 0] - a[i, k, 1] * b[i, k, 1]
             product[i, k, 1] = a[i, k, 0] * b[i, k, 1] + a[i, k, 1] * b[i, k, 0]
+
+
+@compiled
+def encode_each(waves: np.ndarray, position: np.ndarray, z: np.ndarray) -> None:
+    """Encode positions, ``(batch, dimension)``, as :func:`encode` does each."""
+    for b in range(position.shape[0]):
+        encode(waves, position[b], z[b])
+
+
+@compiled
+def before_recalls(
+    even: np.ndarray,
+    odd: np.ndarray,
+    place: np.ndarray,
+    recalled: np.ndarray,
+    held: np.ndarray,
+    contradicted: np.ndarray,
+    seen: np.ndarray,
+    model: np.ndarray,
+    flags: np.ndarray,
+    value: np.ndarray,
+    now: np.ndarray,
+    learns: np.ndarray,
+    plasticity: np.ndarray,
+) -> None:
+    """Do :func:`to_features` and :func:`before_recall` for each animal; all arrays lead with them.
+
+    ``value`` is of ``place``; ``learns`` and ``plasticity`` are written besides ``now``.
+    """
+    for b in range(place.shape[0]):
+        to_features(even, odd, place[b], value[b])
+        before_recall(recalled[b], held[b], contradicted[b], seen[b], model, flags, now[b])
+        learns[b], plasticity[b] = now[b, 3], now[b, 4]
+
+
+@compiled
+def fourier_of_recalls(
+    even: np.ndarray,
+    odd: np.ndarray,
+    recall: np.ndarray,
+    vector: np.ndarray,
+    recalled: np.ndarray,
+    back: np.ndarray,
+) -> None:
+    """Do :func:`to_fourier` for the recall of each animal, and write the conjugates of vectors."""
+    for b in range(recall.shape[0]):
+        to_fourier(even, odd, recall[b], recalled[b])
+        for k in range(vector.shape[1]):
+            back[b, k, 0], back[b, k, 1] = vector[b, k, 0], -vector[b, k, 1]
+
+
+@compiled
+def after_recalls(
+    implied: np.ndarray,
+    here: np.ndarray,
+    seen: np.ndarray,
+    familiar: np.ndarray,
+    contradicted: np.ndarray,
+    now: np.ndarray,
+    model: np.ndarray,
+    flags: np.ndarray,
+    pull: np.ndarray,
+    says: np.ndarray,
+) -> None:
+    """Do :func:`after_recall` for each animal; strength, agreement, gate and lost to ``says``."""
+    said = np.zeros(3, dtype=pull.dtype)
+    for b in range(implied.shape[0]):
+        after_recall(
+            implied[b], here[b], seen[b], familiar[b : b + 1], contradicted[b : b + 1], now[b],
+            model, flags[1] != 0, said, pull[b],
+        )  # fmt: skip
+        says[b, 0], says[b, 1], says[b, 2], says[b, 3] = now[b, 0], said[0], said[1], now[b, 1]

@@ -119,7 +119,7 @@ def _vectors_are_bound(draw):
     ]
 
 
-@case("spiking.learning.memorise")
+@case("spiking.learning.memorise", "spiking.learning.drive_by_keys")
 def _a_memory_recalls_and_learns(draw):
     memory = with_state(made("memory"), draw)
     key, value = (torch.from_numpy(draw.standard_normal((2, n))) for n in (5, 13))
@@ -173,7 +173,12 @@ def animals(tier):
     return SSPSLAM(config, torch.eye(3, 37), batch=2)
 
 
-@case("spiking.vector_steps.advance", "spiking.vector_steps.times")
+@case(
+    "spiking.vector_steps.advance", "spiking.vector_steps.times",
+    *(f"spiking.vector_steps.{name}" for name in (
+        "encode_each", "before_recalls", "fourier_of_recalls", "after_recalls",
+    )),
+)  # fmt: skip
 def _animals_localise_and_map(draw):
     low = draw.uniform(-0.3, 0.3, (3, 2, 3, 2))
     view = LandmarkView(
