@@ -384,7 +384,7 @@ class PathIntegrator(BasePathIntegrator):
         neurons, tables = cast(NeuronArray, self._modules["neurons"]), self.decoder.tables()
         of = (
             self.config, tables, view(self, "fastest_rad_s"), view(self, "decoders"),
-            state[0].shape, state[0].dtype, *neurons.given(),
+            state[0].dtype, self.velocity, *neurons.given(),
         )  # fmt: skip
         steps = self._steps
         if not steps.holds(of):
