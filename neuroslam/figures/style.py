@@ -72,9 +72,29 @@ def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
 
 
 def write_title(axes: Axes, name: str, counts: str = "") -> None:
-    """Write the title at the left of a panel, and counts or notes at the right."""
-    axes.set_title(name)
+    """Write the title at the left of a panel, and counts or notes at the right.
+
+    Where both do not fit into one line, the counts are in a line below.
+    """
+    too_long = _BOLD_IN * len(name) + _SMALL_IN * len(counts) > _width_in(axes)
+    axes.set_title(f"{name}\n" if counts and too_long else name)
     axes.set_title(counts, loc="right", fontsize=8, fontweight="normal")
+
+
+_BOLD_IN, _SMALL_IN = 0.1, 0.068
+"""Mean widths of a letter of a title, and of the counts beside it, in inches."""
+
+
+def _width_in(axes: Axes) -> float:
+    """Return the width of a panel in inches, about: a figure is laid out when it is drawn."""
+    figure, spec = axes.get_figure(root=True), axes.get_subplotspec()
+    width = math.inf if figure is None else float(figure.get_figwidth())
+    if spec is None:
+        return width
+    columns = spec.get_gridspec().ncols
+    inside = axes.get_figure(root=False)
+    share = 1.0 if figure is None or inside is None else inside.bbox.width / figure.bbox.width
+    return max(1.0, share * width * len(spec.colspan) / columns - 0.8)
 
 
 def legend_below(axes: Axes, columns: int) -> None:
@@ -113,6 +133,26 @@ def write_decimals(axis: Axis) -> None:
 def plain_text(text: str) -> str:
     """Escape a name for matplotlib, where a $ begins a formula, and control characters are none."""
     return printable(text).replace("$", r"\$")
+
+
+_SPOKEN = {"world": "rendered world", "arena": "arena", "camera": "camera", "track": "track"}
+"""Prefix of the name of a source -> what it is, in a title."""
+
+
+def readable_source(name: str) -> str:
+    """Return the name of a source as a title has it; that of a file stays.
+
+    Example:
+        >>> readable_source("world:corridor?laps=2&seed=1"), readable_source("lab/drive.mp4")
+        ('rendered world corridor (laps 2, seed 1)', 'lab/drive.mp4')
+    """
+    prefix, colon, rest = name.partition(":")
+    if not colon or prefix not in _SPOKEN or "://" in name:
+        return name
+    what, _, query = rest.partition("?")
+    options = ", ".join(part.replace("=", " ") for part in query.split("&") if part)
+    named = f"{_SPOKEN[prefix]} {what.rpartition('/')[2]}"
+    return f"{named} ({options.replace('_', ' ')})" if options else named
 
 
 def shortened(name: str, most: int = 44) -> str:

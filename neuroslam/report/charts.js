@@ -13,7 +13,8 @@ function makeChart(title, unit, height, series, { low = null, high = null, limit
   const readouts = series.map((one) => make("b", { text: "" }));
   const head = make("div", { class: "head" }, make("h3", { text: title }), unit ? make("span", { text: unit }) : null,
     ...series.map((one, i) => {
-      const key = make("i", { class: one.dots ? "key-dot" : "key-line" });
+      const kind = one.dots ? "key-dot" : `key-line${one.dash ? " dashed" : ""}${one.width > 3 ? " thick" : ""}`;
+      const key = make("i", { class: kind });
       one.key = key;
       return make("span", {}, key, one.name, readouts[i]);
     }));
@@ -126,7 +127,8 @@ function drawSeries(pen, one, chart) {
     return;
   }
   // In each column of pixels only the least, the greatest and the last value are drawn.
-  pen.lineWidth = 1.4;
+  pen.lineWidth = one.width ?? 1.4;
+  pen.setLineDash(one.dash ?? []);
   pen.lineJoin = "round";
   pen.beginPath();
   let down = false, column = null, least = 0, most = 0, last = 0, before = NaN;
@@ -150,6 +152,7 @@ function drawSeries(pen, one, chart) {
   }
   finish();
   pen.stroke();
+  pen.setLineDash([]);
 }
 
 const charts = [];
@@ -178,9 +181,10 @@ function startCharts() {
     { name: "revisit", dots: true, digits: 0, colour: () => colours.loop, value: (i) => (run.row_action[i] >= 2 && run.row_place[i] >= 0 ? run.row_place[i] : none) },
   ], { low: 0 });
   add("Size of the map", "counts", 110, [
-    { name: "links", digits: 0, colour: () => colours.loop, value: column("row_n_links") },
-    { name: "experiences", digits: 0, colour: () => colours.map, value: column("row_n_experiences") },
-    ...(run.templates.shape[0] ? [{ name: "templates", digits: 0, colour: () => colours.path, value: column("row_n_templates") }] : []),
+    // The counts are often equal: a wide line, a line on it, and dashes on both.
+    { name: "experiences", digits: 0, width: 5, colour: () => colours.third, value: column("row_n_experiences") },
+    { name: "links", digits: 0, width: 2, colour: () => colours.loop, value: column("row_n_links") },
+    ...(run.templates.shape[0] ? [{ name: "templates", digits: 0, width: 2, dash: [5, 7], colour: () => colours.ink, value: column("row_n_templates") }] : []),
   ], { low: 0 });
   const [nXY, nTheta] = about.torus;
   if (about.cells.includes("pose")) {

@@ -14,9 +14,10 @@ import numpy as np
 from neuroslam.brain import NavigationBrain
 from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.pose import PoseCellNetwork
+from neuroslam.config import BrainConfig, build_config, preset_names, read_preset
 from neuroslam.errors import MapError, counted
 from neuroslam.evaluation.trajectory import align
-from neuroslam.figures.style import render
+from neuroslam.figures.style import readable_source, render
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.merging.report import MergeReport
 from neuroslam.report.decisions import cells_apart
@@ -25,6 +26,7 @@ from neuroslam.report.rows import config_rows, metric_rows
 from neuroslam.runs.cells import activity_of, draw_cells
 from neuroslam.runs.reading import (
     experiences_of,
+    moved_onto,
     odometry_track,
     trajectory,
     true_poses,
@@ -79,8 +81,9 @@ def collect(run: FinishedRun) -> Facts:
             f"{key}_row": np.searchsorted(rows, curve.rows).clip(max=len(rows) - 1),
             f"{key}_value": curve.values,
         }
+    base_name, base = _base(run)
     about = {
-        "name": run.plan.name,
+        "name": readable_source(run.plan.name),
         "unit": _unit(run),
         "cells": list(run.brain.config.cells),
         "torus": [run.brain.config.pose_cells.n_xy, run.brain.config.pose_cells.n_theta],
@@ -95,7 +98,8 @@ def collect(run: FinishedRun) -> Facts:
         "not_joined": run.metrics.get("not_joined", []),
         "skipped": run.metrics.get("skipped", []),
         "metrics": metric_rows(run.metrics, _unit(run)),
-        "config": config_rows(run.brain.config),
+        "config": config_rows(run.brain.config, base),
+        "base": base_name,
         "range": {"start": run.plan.start, "stop": run.plan.stop,
                   "on_bad_frame": run.plan.on_bad_frame},
         "truth_scale": truth_on_map(trajectory(run.brain, run.trace), true_poses(run.trace))[1],
@@ -160,7 +164,8 @@ def _rows(run: FinishedRun, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Return the columns of all frames; experiences and poses are those of the final map."""
     frames, trace, brain = run.frames, run.trace, run.brain
     place = experiences_of(brain, trace)[0]
-    track, odometry = trajectory(brain, trace), odometry_track(brain.config, trace)
+    track = trajectory(brain, trace)
+    odometry = moved_onto(odometry_track(brain.config, trace), track)
     truth = truth_on_map(track, true_poses(trace))[0]
     whole = {
         "frame": frames["frame"].astype(np.int32),
@@ -412,6 +417,15 @@ def _summary(run: FinishedRun) -> dict[str, Any]:
         "ate_m": run.metrics.get("ate_rmse_m"),
         "odometry_ate_m": run.metrics.get("odometry_ate_rmse_m"),
     }
+
+
+def _base(run: FinishedRun) -> tuple[str, BrainConfig]:
+    """Return the config that the run began with, and its name: its preset, or the defaults."""
+    sessions = run.brain.sessions.sessions
+    preset = sessions[-1].preset if sessions else ""
+    if preset in preset_names():
+        return f"the preset {preset}", build_config(read_preset(preset), f"preset {preset}")
+    return "the defaults", BrainConfig()
 
 
 def _sessions(run: FinishedRun) -> list[dict[str, Any]]:

@@ -29,7 +29,10 @@ const map = {
 
   start() {
     this.canvas.style.background = "transparent";
-    this.sheets = [makeSheet(paintStill), makeSheet(paintProgress, paintProgressOn)];
+    const growing = (paintOn) => makeSheet((pen, at, dot) => paintOn(pen, at, dot, -1), paintOn);
+    this.below = [makeSheet(paintStill), growing(paintPlaces), growing(paintPath)];
+    this.above = growing(paintLoops);  // over the robot, which would hide them
+    this.sheets = [...this.below, this.above];
     this.spread();
     new ResizeObserver(() => this.resize()).observe(this.canvas);
     watch("row", () => this.draw());
@@ -69,8 +72,10 @@ const map = {
     if (!this.width) return;
     const pen = fitCanvas(this.canvas, this.width, this.height);
     drawGrid(pen, this);
-    for (const sheet of this.sheets) sheet.draw(pen, this, settled);
-    drawLive(pen, this);
+    for (const sheet of this.below) sheet.draw(pen, this, settled);
+    drawRobot(pen, this);
+    this.above.draw(pen, this, settled);
+    drawMarks(pen, this);
   },
   sx(x) { return (x - this.view.x) * this.view.scale + this.width / 2; },
   sy(y) { return (this.view.y - y) * this.view.scale + this.height / 2; },
@@ -224,21 +229,26 @@ function paintStill(pen, at, dot) {
   if (layers.loops.on) drawLoops(pen, at, dot, (i) => known.linkRow[i] < 0);
 }
 
-function paintProgress(pen, at, dot) { paintProgressOn(pen, at, dot, -1); }
+// What the robot has seen, driven and closed up to the chosen row, from the row after `from` on.
+const seenSince = (from) => {
+  const seen = new Set();
+  for (let i = Math.max(0, from); i <= chosen.row && i < known.rows; i++) if (run.row_place[i] >= 0) seen.add(run.row_place[i]);
+  return seen;
+};
 
-function paintProgressOn(pen, at, dot, from) {
-  const row = chosen.row;
+function paintPlaces(pen, at, dot, from) { drawPlaces(pen, at, dot, seenSince(from)); }
+
+function paintPath(pen, at, dot, from) {
+  if (!layers.track.on || !known.rows) return;
   pen.lineJoin = pen.lineCap = "round";
-  if (layers.track.on && known.rows) {
-    pen.strokeStyle = colours.path;
-    pen.lineWidth = dot < 2 ? 1.2 : 2;
-    line(pen, at, run.row_x_m, run.row_y_m, Math.max(0, from), row);
-  }
-  const seen = new Set();  // redrawn: the path may cover experiences of an earlier lap
-  for (let i = Math.max(0, from); i <= row && i < known.rows; i++) if (run.row_place[i] >= 0) seen.add(run.row_place[i]);
-  drawPlaces(pen, at, dot, seen);
-  const made = (link) => known.linkRow[link] >= 0 && known.linkRow[link] <= row;
-  if (layers.loops.on) drawLoops(pen, at, dot, (i) => made(i) && (seen.has(run.link_to[i]) || known.linkRow[i] > from));
+  pen.strokeStyle = colours.path;
+  pen.lineWidth = dot < 2 ? 1.2 : 2;
+  line(pen, at, run.row_x_m, run.row_y_m, Math.max(0, from), chosen.row);
+}
+
+function paintLoops(pen, at, dot, from) {
+  const made = (link) => known.linkRow[link] > from && known.linkRow[link] <= chosen.row;
+  if (layers.loops.on) drawLoops(pen, at, dot, made);
 }
 
 function drawLinks(pen, at, colour, width, wanted) {

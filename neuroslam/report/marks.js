@@ -14,7 +14,8 @@ function drawGrid(pen, at) {
   pen.font = "11px system-ui, sans-serif";
   pen.textAlign = "center";
   pen.textBaseline = "bottom";
-  for (const x of across.ticks) if (at.sx(x) > 60 && at.sx(x) < at.width - 30) pen.fillText(x.toFixed(across.digits), at.sx(x), at.height - 6);
+  const free = Math.max(60, 26 + pen.measureText(about.unit).width);
+  for (const x of across.ticks) if (at.sx(x) > free && at.sx(x) < at.width - 30) pen.fillText(x.toFixed(across.digits), at.sx(x), at.height - 6);
   pen.textAlign = "left";
   pen.textBaseline = "middle";
   for (const y of up.ticks) if (at.sy(y) > 50 && at.sy(y) < at.height - 26) pen.fillText(y.toFixed(up.digits), 6, at.sy(y));
@@ -33,7 +34,8 @@ function ring(pen, x, y, radius, colour, width) {
   pen.stroke();
 }
 
-function drawLive(pen, at) {
+// What is marked or selected, above all.
+function drawMarks(pen, at) {
   const dot = at.dot, px = (i) => at.sx(run.place_x_m[i]), py = (i) => at.sy(run.place_y_m[i]);
   if (layers.ids.on && at.spacing * at.view.scale > 26) drawIds(pen, at, dot);
   if (layers.plan.on && run.plan_place) drawPlan(pen, at, dot);
@@ -66,6 +68,11 @@ function drawLive(pen, at) {
     pen.fill();
   }
   if (at.hovered >= 0 && at.hovered !== chosen.place) ring(pen, px(at.hovered), py(at.hovered), dot + 3, colours.soft, 1.5);
+}
+
+// The start, the recent path, and the robot: below the loop closures.
+function drawRobot(pen, at) {
+  const dot = at.dot, px = (i) => at.sx(run.place_x_m[i]), py = (i) => at.sy(run.place_y_m[i]);
   if (!known.rows) return;
   if (run.row_x_m[0] === run.row_x_m[0]) {
     pen.fillStyle = colours.panel;

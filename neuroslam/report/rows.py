@@ -46,9 +46,14 @@ def metric_rows(metrics: dict[str, Any], length: str = "m") -> list[list[Any]]:
     return rows
 
 
-def config_rows(config: BrainConfig) -> list[dict[str, Any]]:
-    """Return every parameter by section: value, default, whether they differ, description."""
-    plain = BrainConfig()
+def config_rows(config: BrainConfig, base: BrainConfig | None = None) -> list[dict[str, Any]]:
+    """Return every parameter by section: value, default, whether they differ, description.
+
+    Args:
+        config: The config.
+        base: The config that it is compared with, as that of a preset; default: the defaults.
+    """
+    plain = base or BrainConfig()
     general: dict[str, Any] = {"section": "brain", "used": True, "rows": []}
     sections = [general]
     views = any(cls.needs_views for cls in population_classes(config))

@@ -3,7 +3,7 @@
 
 function startHeadline() {
   const s = about.summary, parts = [];
-  if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} ${about.unit} driven`);
+  if (s.frames) parts.push(many(s.frames, "frame"), duration(s.seconds), `${s.driven_m.toFixed(s.driven_m < 100 ? 1 : 0)} ${about.unit === "m" ? "m" : "(arbitrary unit)"} driven`);
   parts.push(many(s.places, "experience"), many(s.loop_closures, "loop closure"));
   if (about.sessions.length > 1) parts.push(many(about.sessions.length, "session"));
   if (about.merges.length) parts.push(many(about.merges.length, "merge"));
@@ -118,19 +118,22 @@ function startMetrics() {
 
 function startConfig() {
   const all = about.config.flatMap((part) => part.rows), differing = all.filter((row) => row.differs);
-  const box = make("input", { type: "checkbox", id: "only" }), columns = make("div", { class: "config-columns" });
+  const box = make("input", { type: "checkbox", id: "only" }), columns = make("div", { class: "config-columns only-differing" });
+  box.checked = true;
   box.addEventListener("change", () => columns.classList.toggle("only-differing", box.checked));
   const { start, stop, on_bad_frame } = about.range;
-  $("config-list").append(
-    make("p", { class: "lead", text: `${differing.length} of ${all.length} parameters differ from their defaults and are marked. Frames ${start} to ${stop === null ? "the end" : stop - 1} of the source; bad frames: ${on_bad_frame}.` }),
+  const folded = make("details", { open: innerWidth > 960 },
+    make("summary", { text: `${differing.length} of ${all.length} parameters differ from ${about.base}` }),
     make("label", {}, box, " only parameters that differ"), columns);
+  $("config-list").append(
+    make("p", { class: "lead", text: `Frames ${start} to ${stop === null ? "the end" : stop - 1} of the source; bad frames: ${on_bad_frame}.` }), folded);
   for (const part of about.config) {
     const has = part.rows.some((row) => row.differs);
     columns.append(make("div", { class: `config-part${part.used ? "" : " unused"}${has ? " has-differing" : ""}` },
       make("h3", { text: part.section + (part.used ? "" : ", not in use") }),
       make("table", {}, make("tbody", {}, ...part.rows.map((row) => make("tr", { class: row.differs ? "differs" : "", title: row.what },
         make("td", { text: row.key }), make("td", { text: row.value }),
-        make("td", { class: "soft", text: row.differs ? `default ${row.default}` : "" })))))));
+        make("td", { class: "soft", text: row.differs ? `${about.base === "the defaults" ? "default" : "preset"} ${row.default}` : "" })))))));
   }
 }
 
@@ -173,7 +176,7 @@ function showLegend() {
   } else add("key-ramp", { background: rampStyle }, `low to high: ${colourings[map.colouring]}`);
   if (layers.links.on) add("key-line", colour(colours.link), "links");
   if (layers.loops.on) add("key-line", colour(colours.loop), "loop closures");
-  if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame");
+  if (layers.track.on) add("key-line", colour(colours.path), "path up to the frame, the last seconds wide");
   if (layers.odometry.on) add("key-line", colour(colours.odometry), "odometry alone");
   if (layers.truth.on) add("key-line dashed", colour(colours.truth), Math.abs(about.truth_scale - 1) < 0.02 ? "truth" : `truth, scaled by ${(1 / about.truth_scale).toFixed(2)}`);
   if (layers.plan.on) add("key-line", { borderColor: colours.plan, borderTopWidth: "4px" }, "planned path");

@@ -15,11 +15,12 @@ from neuroslam.cells.pose import PoseCellNetwork
 from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_activity, plot_map, plot_pose_cells, plot_signals
 from neuroslam.figures.places import plot_place_cells
-from neuroslam.figures.style import plain_text, save, shortened
+from neuroslam.figures.style import plain_text, readable_source, save, shortened
 from neuroslam.runs.cells import activity_of, draw_cells
 from neuroslam.runs.files import RunPlan, brain_file
 from neuroslam.runs.reading import (
     length_unit,
+    moved_onto,
     odometry_track,
     read_frames,
     read_plan,
@@ -108,17 +109,19 @@ def draw_map(
     """
     present, brain = brain, brain.largest
     links, truth, log = brain.map.links, true_poses(trace), brain.sessions
-    track = trajectory(brain, trace)[:, :2]
+    poses = trajectory(brain, trace)
+    track = poses[:, :2]
     on_map = np.isfinite(track[:, 0])
+    odometry = moved_onto(odometry_track(brain.config, trace), poses)
     names, number = _session_names(brain), {s.id: i for i, s in enumerate(log.sessions)}
     several = len(names) > 1
     alone = log.sessions and len(log.this_drive()) == 1
-    whose = names[-1] if alone else plain_text(shortened(plan.name))
+    whose = names[-1] if alone else plain_text(shortened(readable_source(plan.name)))
     made_by = np.array([number[one] for one in brain.map.experiences["session"].tolist()], np.int64)
     figure = plot_map(
         brain.map.poses,
         np.column_stack([links.source, links.target]),
-        odometry_xy=odometry_track(brain.config, trace)[:, :2],
+        odometry_xy=odometry[:, :2],
         track_xy=track[on_map],
         truth_xy=None if truth is None else truth[on_map, :2],
         current=brain.map.pose if brain is present else None,
@@ -135,9 +138,11 @@ def draw_map(
 def _title(brain: NavigationBrain, plan: RunPlan, on_map: np.ndarray, n_stored: int) -> str:
     """Return the title: source, frames, sessions, and frames on maps that were not joined."""
     n, sources = len(on_map), dict.fromkeys(s.source for s in brain.sessions.sessions)
-    title = f"{plan.name}: {counted(n, 'frame')}"
+    title = f"{readable_source(plan.name)}: {counted(n, 'frame')}"
     if len(brain.sessions.sessions) > 1:
-        named = ", ".join(shortened(source or "unknown source") for source in sources)
+        named = ", ".join(
+            shortened(readable_source(source or "unknown source")) for source in sources
+        )
         title = f"{len(brain.sessions.sessions)} sessions on one map: {named}"
     title = textwrap.fill(plain_text(title), _TITLE_WIDTH, max_lines=3, placeholder=" …")
     apart = n - int(on_map.sum())
@@ -156,5 +161,7 @@ def _session_names(brain: NavigationBrain) -> list[str]:
     names = []
     for session in sessions:
         since = f" from frame {session.first_frame}" if times[session.source] > 1 else ""
-        names.append(plain_text(shortened(session.source or "unknown source") + since))
+        names.append(
+            plain_text(shortened(readable_source(session.source or "unknown source")) + since)
+        )
     return names

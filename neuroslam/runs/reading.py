@@ -146,6 +146,40 @@ def odometry_track(config: BrainConfig, trace: dict[str, np.ndarray]) -> np.ndar
     return integrate_velocities(trace["v_m_s"], trace["w_rad_s"], trace["dt_s"], start)
 
 
+def moved_onto(odometry: np.ndarray, track: np.ndarray) -> np.ndarray:
+    r"""Turn and move dead reckoning so that it begins where the track does, for a picture of both.
+
+    The rotation is the one that brings the two nearest to each other about their common start,
+
+    .. math:: \alpha = \arg\min_\alpha \sum_i \lVert R_\alpha (o_i - o_0) - (p_i - p_0) \rVert^2
+        = \operatorname{atan2}\Big(\sum_i o'_i \times p'_i, \sum_i o'_i \cdot p'_i\Big)
+
+    Args:
+        odometry: Poses by dead reckoning, ``(frames, 3)``: m, m, rad.
+        track: Poses on the map, of equal shape; NaN where a frame is on no joined map.
+
+    Returns:
+        Poses of ``odometry`` in the coordinates of the map; as they are if no frame is on it.
+
+    Example:
+        >>> line = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> up = np.array([[5.0, 5.0, 0.0], [5.0, 7.0, 0.0]])
+        >>> moved_onto(line, up).round(3)[:, :2].tolist()
+        [[5.0, 5.0], [5.0, 6.0]]
+    """
+    known = np.flatnonzero(np.isfinite(track[:, 0]))
+    if not len(known):
+        return odometry
+    first = known[0]
+    own = odometry[:, :2] - odometry[first, :2]
+    there = track[known, :2] - track[first, :2]
+    dot = float((own[known] * there).sum())
+    cross = float((own[known, 0] * there[:, 1] - own[known, 1] * there[:, 0]).sum())
+    turn = math.atan2(cross, dot) if dot or cross else 0.0
+    turned = own @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    return np.column_stack([turned + track[first, :2], odometry[:, 2] + turn])
+
+
 def frame_rows(out: str | Path, rows: int | None = None) -> list[str]:
     """Read the rows of ``frames.csv`` as text, up to the first incomplete row.
 

@@ -57,7 +57,8 @@ def show(browser):
     complaints, contexts = [], []
 
     def open_page(path, **settings):
-        context = browser.new_context(viewport={"width": 1366, "height": 768}, **settings)
+        settings = {"viewport": {"width": 1366, "height": 768}} | settings
+        context = browser.new_context(**settings)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -126,7 +127,8 @@ def test_the_arrays_arrive_as_they_were(page, runs):
     frames = read_frames(runs / "second")
     assert page.evaluate("Array.from(run.row_frame)") == frames["frame"].tolist()
     assert page.evaluate("Array.from(run.row_time_s)") == frames["time_s"].tolist()
-    assert page.locator("h1").inner_text() == WORLD
+    named = "rendered world ellipse (laps 2, width 96, height 24, frames per lap 90)"
+    assert page.locator("h1").inner_text() == named
 
 
 def test_a_click_on_a_place_shows_its_picture_template_links_and_visits(page):
@@ -305,8 +307,45 @@ def test_the_planned_path_is_drawn(show, runs, tmp_path):
 def test_only_what_differs_can_be_shown_of_the_config(page):
     parts = page.locator(".config-part")
     assert parts.count() > 8
-    page.locator("#only").check()
     assert parts.locator("visible=true").count() == 0, "this run has the defaults"
+    assert page.locator("#config-list summary").inner_text().startswith("0 of ")
+    page.locator("#only").uncheck()
+    assert parts.locator("visible=true").count() == parts.count()
+
+
+def test_on_a_phone_nothing_covers_the_map_and_the_config_is_folded(show, runs):
+    page = show(runs / "second" / "report.html", viewport={"width": 400, "height": 800})
+    area, legend, nav = (
+        page.locator(name).bounding_box() for name in (".map-area", "#legend", ".top nav")
+    )
+    assert legend["y"] >= area["y"] + area["height"] - 1
+    assert legend["y"] + legend["height"] < 800
+    assert nav["height"] < 40, "one row of links"
+    assert not page.locator(".config-part").first.is_visible()
+    assert page.locator("#config-list details").get_attribute("open") is None
+
+
+def test_curves_that_lie_on_each_other_differ_in_width_and_dash(page):
+    keys = page.locator(".chart", has_text="Size of the map").locator(".head i")
+    looks = keys.evaluate_all(
+        "all => all.map(k => { const s = getComputedStyle(k);"
+        " return [s.borderTopWidth, s.borderTopStyle].join(); })"
+    )
+    assert len(set(looks)) == len(looks) == 3
+
+
+def test_the_loop_closures_are_drawn_over_the_robot(page):
+    order = page.evaluate(
+        """() => {
+          const seen = [], inner = [drawRobot, drawLoops];
+          drawRobot = (...all) => { seen.push("robot"); inner[0](...all); };
+          const draw = map.above.draw;
+          map.above.draw = (...all) => { seen.push("loops"); draw.apply(map.above, all); };
+          map.paint();
+          return seen;
+        }"""
+    )
+    assert order == ["robot", "loops"]
 
 
 def test_it_follows_the_light_or_dark_of_the_system_and_can_be_switched(show, runs):
