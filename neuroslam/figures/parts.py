@@ -169,9 +169,10 @@ def _draw_experiences(
 def _draw_ends(axes: Axes, xy: np.ndarray, end: bool = True) -> None:
     style: dict[str, Any] = {"ls": "none", "mec": INK, "mew": 1.4, "zorder": 7}
     if len(xy):
-        axes.plot(*xy[0], marker="o", ms=8, mfc="white", label="start", **style)
+        # Larger than the end and above it: the two are often at one point.
+        axes.plot(*xy[0], marker="o", ms=10, mfc="none", label="start", **style)
     if len(xy) and end:
-        axes.plot(*xy[-1], marker="s", ms=6.5, mfc=INK, label="end", **style)
+        axes.plot(*xy[-1], marker="s", ms=4.5, mfc=INK, label="end", **style)
 
 
 def draw_pose_cells(
@@ -239,11 +240,16 @@ def draw_signals(
     axes = figure.subplots(1 + has_views, 1, sharex=True, squeeze=False)[:, 0]
     if has_views:
         _draw_recognition(axes[0], frames, threshold)
-    columns = (("n_links", LOOP), ("n_experiences", MAP), ("n_templates", OTHER))
-    for name, colour in columns[: 2 + has_views]:
+    # The counts are often equal: a wide line, a line on it, and dashes on both.
+    columns: tuple[tuple[str, str, float, Any], ...] = (
+        ("n_links", "#56B4E9", 4.5, "-"), ("n_experiences", LOOP, 1.6, "-"),
+        ("n_templates", INK, 1.6, (0, (3, 4))),
+    )  # fmt: skip
+    for name, colour, width, dash in columns[: 2 + has_views]:
         counts = np.asarray(frames[name])
         last = int(counts[-1]) if len(counts) else 0
-        axes[-1].plot(frames["time_s"], counts, color=colour, lw=1.6, label=f"{last:,} {name[2:]}")
+        label = f"{last:,} {name[2:]}"
+        axes[-1].plot(frames["time_s"], counts, color=colour, lw=width, ls=dash, label=label)
     axes[-1].set(xlabel="time (s)", ylabel="count")
     axes[-1].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes[-1].yaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))

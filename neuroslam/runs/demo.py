@@ -11,9 +11,16 @@ from neuroslam.config import BrainConfig
 from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_summary
 from neuroslam.figures.sessions import Stage, plot_stages
-from neuroslam.figures.style import save
+from neuroslam.figures.style import readable_source, save
 from neuroslam.runs.files import brain_file, require_free
-from neuroslam.runs.reading import odometry_track, read_frames, read_plan, read_trace, trajectory
+from neuroslam.runs.reading import (
+    moved_onto,
+    odometry_track,
+    read_frames,
+    read_plan,
+    read_trace,
+    trajectory,
+)
 from neuroslam.runs.results import RunSummary
 from neuroslam.runs.run import run
 from neuroslam.sensors import open_source
@@ -131,10 +138,10 @@ def draw_summary(out: str | Path, path: Path) -> None:
         image=last.image,
         template=brain.view.template_image(seen) if seen >= 0 else None,
         threshold=brain.config.view.threshold,
-        odometry_xy=odometry_track(brain.config, trace)[:, :2],
+        odometry_xy=moved_onto(odometry_track(brain.config, trace), track)[:, :2],
         track_xy=track[on],
         truth_xy=truth[on] if np.isfinite(truth).all() else None,
         current=brain.map.pose,
-        title=f"{source.name}: {len(trace['time_s'])} frames",
+        title=f"{readable_source(source.name)}: {len(trace['time_s'])} frames",
     )
     save(figure, path)
