@@ -13,7 +13,7 @@ from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, fi
 from neuroslam.state.files import load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> str:
@@ -53,6 +53,8 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         tensors = _without_unused(tensors, config)
     if about["format"] < 6:
         tensors = _beside_paths(tensors)
+    if about["format"] < 7:
+        tensors = _after_calm(tensors)
     return config, tensors
 
 
@@ -104,6 +106,14 @@ def _beside_paths(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Convert a state of formats up to 5, whose maps place the robot by odometry alone."""
     maps = [name.removesuffix("current") for name in tensors if name.endswith("map.state.current")]
     return tensors | {f"{one}on_path": torch.tensor(0) for one in maps}
+
+
+def _after_calm(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Convert a state of formats up to 6, which have no largest recent change of the view."""
+    ends = "continuity.state.usual"
+    calm = torch.tensor(0.0, dtype=torch.float64)
+    known = [name.removesuffix("usual") for name in tensors if name.endswith(ends)]
+    return tensors | {f"{one}recent": calm.clone() for one in known}
 
 
 def _of_one_session(

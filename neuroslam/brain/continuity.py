@@ -20,6 +20,10 @@ _SETTLED = 30
 _STEP = 0.02
 """Relative step of the running median per frame."""
 
+_ROUGH, _CALMS = 2.0, 0.8
+"""Change, as a multiple of the largest recent one, below which it is a bump that goes on, and the
+share of that largest one that is left after a frame."""
+
 
 class Change(Scalars):
     """How the views of a drive change.
@@ -27,11 +31,13 @@ class Change(Scalars):
     Attributes:
         frames: How many were compared.
         usual: Running median of the change between two.
+        recent: Largest change of the last frames, which fades.
         turned: By how many columns of a view the robot turned since the last one.
     """
 
     frames: int
     usual: float
+    recent: float
     turned: float
 
 
@@ -51,9 +57,11 @@ class Continuity(AboutNow):
     r"""Decides from two successive views whether the robot was kidnapped between them.
 
     The change :math:`d` between two frames is the mean difference of their views at the best shift.
-    The robot was kidnapped if :math:`d > \max(\theta, f\,\tilde d)`, with the match threshold
-    :math:`\theta`, the factor :math:`f` and the running median :math:`\tilde d`. A turn beyond
-    the range of shifts makes such a change too and is ignored.
+    The robot was kidnapped if :math:`d > \max(\theta, f\,\tilde d, 2 m)`, with the match threshold
+    :math:`\theta`, the factor :math:`f`, the running median :math:`\tilde d` and the largest recent
+    change :math:`m \leftarrow \max(0.8\, m, d)`: a bump or a blurred turn builds up over some
+    frames, a kidnapping comes out of calm. A turn beyond the range of shifts makes such a change
+    too and is ignored.
     """
 
     before: Tensor
@@ -65,7 +73,7 @@ class Continuity(AboutNow):
         self.shift = math.inf if config.view.panoramic else config.view.shift_match
         self.columns_per_rad = config.view.template_width / math.radians(config.odometry.fov_deg)
         self.geometry = Geometry.of(config.view)
-        self.state = Change(frames=0, usual=0.3 * config.view.threshold, turned=0.0)
+        self.state = Change(frames=0, usual=0.3 * config.view.threshold, recent=0.0, turned=0.0)
         n_pixels = config.view.template_width * config.view.template_height
         self.register_buffer("before", torch.zeros(n_pixels, dtype=torch.uint8))
 
@@ -84,9 +92,10 @@ class Continuity(AboutNow):
         change = float(apart) / (255.0 * self.geometry.n_pixels)
         broken = (
             s.frames > _SETTLED
-            and change > max(self.threshold, self.factor * s.usual)
+            and change > max(self.threshold, self.factor * s.usual, _ROUGH * s.recent)
             and s.turned <= self.shift
         )
+        s.recent = max(_CALMS * s.recent, change)
         if not broken:
             step = max(_STEP, 1.0 / s.frames) * max(s.usual, 0.05 * self.threshold)
             s.usual += math.copysign(step, change - s.usual)

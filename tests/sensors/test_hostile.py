@@ -377,14 +377,15 @@ def test_the_given_drive_of_50_frames_is_read_whole(cases):
     assert len({f.image.shape for f in frames}) == 1
 
 
-@pytest.mark.xfail(reason="a bump and a start line are still taken for kidnappings")
-def test_a_bump_of_the_given_drive_is_no_kidnapping(cases, tmp_path, call):
+@pytest.mark.parametrize("options", [(), ("--preset", "rc_car"), ("--preset", "ratslam")])
+def test_a_bump_of_the_given_drive_is_no_kidnapping(options, cases, tmp_path, call):
     source = cases / "kidnap_false_alarm" / "frames.tar.gz"
-    done = call("run", source, "-o", tmp_path / "o", "--no-tensorboard", "--preset", "rc_car")
+    done = call("run", source, "-o", tmp_path / "o", "--no-tensorboard", *options)
     assert (done.code, done.err) == (0, "")
     figures = json.loads((tmp_path / "o" / "metrics.json").read_text())
     assert figures["frames"] == 50
-    assert figures["not_joined"] == []
+    assert (figures["not_joined"], figures["merges"]) == ([], 0)
+    assert figures["frames_on_no_joined_map"] == 0
 
 
 # --- links and separators ------------------------------------------------------------------------
