@@ -5,13 +5,12 @@ A :class:`~neuroslam.state.activity.ActivityLog` in, a matplotlib ``Figure`` out
 """
 
 import math
+import textwrap
 from typing import Any, NamedTuple, cast
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import MaxNLocator
@@ -139,7 +138,17 @@ def plot_population(log: ActivityLog, name: str, most: int = 6, note: str = "") 
     )
     unit = _unit(log, name)
     with mpl.rc_context(STYLE):
-        figure = new_figure(2.35 * len(cells) + 0.9, 9.4, f"{title}\n{note}" if note else title)
+        width_in, height_in = max(2.6 * len(cells) + 0.9, 6.0), 11.0
+        lines = [
+            *textwrap.wrap(title, int(8.5 * width_in)),
+            *textwrap.wrap(note, int(10 * width_in)),
+        ]
+        figure = new_figure(width_in, height_in, None, constrained=False)
+        figure.suptitle("\n".join(lines), fontsize=11, fontweight="bold", y=1.0 - 0.15 / height_in)
+        figure.subplots_adjust(
+            left=0.8 / width_in, right=1.0 - 0.25 / width_in, wspace=0.35,
+            bottom=1.25 / height_in, top=1.0 - (0.65 + 0.2 * len(lines)) / height_in, hspace=0.8,
+        )  # fmt: skip
         axes = np.array([
             [
                 figure.add_subplot(
@@ -151,23 +160,21 @@ def plot_population(log: ActivityLog, name: str, most: int = 6, note: str = "") 
             for row in range(4)
         ])  # fmt: skip
         for k, cell in enumerate(cells.tolist()):
-            write_title(axes[0, k], f"Cell {cell}", _tuned_to(log, name, cell))
-            _draw_map(figure, axes[0, k], measured, k, unit if k == len(cells) - 1 else "")
+            write_title(axes[0, k], f"Cell {cell}\n", _tuned_to(log, name, cell))
+            _draw_map(axes[0, k], measured, k)
             _draw_correlation(axes[1, k], measured, k)
             _draw_heading(axes[2, k], measured, k)
             _draw_speed(axes[3, k], measured, k)
         for ax in axes[[0, 1, 3], 1:].ravel():
             ax.set_ylabel("")
-        scale = ScalarMappable(Normalize(-1.0, 1.0), _CORRELATION)
-        bar = figure.colorbar(scale, ax=axes[1, -1], shrink=0.8, ticks=(-1, 0, 1))
-        bar.set_label("correlation")
-        bar.outline.set_visible(False)
         axes[3, 0].set_ylabel(unit)
-        figure.supxlabel(
-            "white: never visited · tuning to heading: its largest radius is the peak rate of the "
-            "curve · L: mean vector length · r: correlation with speed",
-            fontsize=8,
-        )
+        figure.text(
+            0.5, 0.12 / height_in,
+            f"maps: from 0 (dark) to the peak of each cell (yellow), {unit}; white: never visited\n"
+            "autocorrelograms: from -1 (blue) to 1 (red) · headings: the rim is the peak of the "
+            "curve\nL: mean vector length · r: correlation with speed",
+            fontsize=8, ha="center", va="bottom",
+        )  # fmt: skip
     return figure
 
 
@@ -213,20 +220,15 @@ def plot_raster(log: ActivityLog, note: str = "") -> Figure:
     return figure
 
 
-def _draw_map(figure: Figure, axes: Axes, measured: CellMaps, k: int, unit: str) -> None:
+def _draw_map(axes: Axes, measured: CellMaps, k: int) -> None:
     shown = measured.maps[k]
     top = float(np.nanmax(shown)) if np.isfinite(shown).any() else 0.0
-    picture = axes.imshow(
+    axes.imshow(
         shown, ACTIVITY, origin="lower", extent=measured.bins.extent_m, vmin=0.0, vmax=top or 1.0
     )
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.set(xlabel=f"x (m)    peak {top:.2g}", ylabel="y (m)", aspect="equal")
     axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
     axes.grid(visible=False)
-    bar = figure.colorbar(picture, ax=axes, shrink=0.8, ticks=(0.0, top or 1.0))
-    bar.ax.set_yticklabels(["0", f"{top:.2g}"])
-    if unit:
-        bar.set_label(unit)
-    bar.outline.set_visible(False)
 
 
 def _draw_correlation(axes: Axes, measured: CellMaps, k: int) -> None:

@@ -62,9 +62,12 @@ STYLE: dict[Any, Any] = {  # names of matplotlib's settings -> values
 }
 
 
-def new_figure(width_in: float, height_in: float, title: str | None) -> Figure:
-    """Return an empty figure for drawing off screen."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+def new_figure(
+    width_in: float, height_in: float, title: str | None, constrained: bool = True
+) -> Figure:
+    """Return an empty figure for drawing off screen; the layout of many panels takes seconds."""
+    layout = "constrained" if constrained else None
+    figure = Figure(figsize=(width_in, height_in), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=12, fontweight="bold")

@@ -67,7 +67,7 @@ def activity_of(
     return log, COMPUTED
 
 
-def draw_cells(log: ActivityLog, note: str, most: int = 6) -> dict[str, Figure]:
+def draw_cells(log: ActivityLog, note: str, most: int = 4) -> dict[str, Figure]:
     """Draw the figures of a run's activity: ``raster.png``, and ``cells_NAME.png`` of each kind.
 
     Args:
