@@ -99,7 +99,7 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
 
 def test_the_map_of_a_merge_names_its_sessions_and_whose_odometry_is_beside_it(merged, drawn):
     title, odometry, names = drawn(merged)
-    assert title == f"2 sessions on one map: {WORLD}"
+    assert title == "2 sessions on one map: rendered world ellip … width 128, height 32)"
     first, second = f"{WORLD} from frame 0", f"{WORLD} from frame 100"
     assert odometry[0] == f"odometry of {second}"
     assert names[:2] == [first, second]
@@ -107,7 +107,7 @@ def test_the_map_of_a_merge_names_its_sessions_and_whose_odometry_is_beside_it(m
 
 def test_a_run_alone_is_titled_by_its_source_and_its_frames(runs, drawn):
     title, odometry, names = drawn(runs / "a")
-    assert title == f"{WORLD}: 200 frames"
+    assert title == "rendered world ellipse (laps 2, width 128, height 32): 200 frames"
     assert (odometry[0], names[0]) == ("odometry", "experiences, links")
 
 
@@ -115,11 +115,11 @@ def test_the_map_says_how_many_frames_are_on_maps_that_were_not_joined(runs):
     brain, plan = load_brain(runs / "a" / "brain.safetensors"), RunPlan("long/way/drive.mp4")
     on_map = np.arange(1000) < 28
     brain.store(load_brain(runs / "elsewhere" / "brain.safetensors"))
-    assert plot._title(brain, plan, on_map).splitlines() == [
+    assert plot._title(brain, plan, on_map, 1).splitlines() == [
         "way/drive.mp4: 1,000 frames",
         "972 of 1,000 frames are on maps that were not joined",
     ]
-    all_here = plot._title(brain, plan, on_map[:28])
+    all_here = plot._title(brain, plan, on_map[:28], 1)
     assert all_here == "way/drive.mp4: 28 frames\n1 stored map was not joined"
 
 
