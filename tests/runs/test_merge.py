@@ -99,8 +99,9 @@ def test_two_overlapping_runs_merge_into_the_files_of_a_run(runs, tmp_path, call
 
 def test_the_map_of_a_merge_names_its_sessions_and_whose_odometry_is_beside_it(merged, drawn):
     title, odometry, names = drawn(merged)
-    assert title == "2 sessions on one map: rendered world ellip … width 128, height 32)"
-    first, second = f"{WORLD} from frame 0", f"{WORLD} from frame 100"
+    world = "rendered world ellip … width 128, height 32)"
+    assert title == f"2 sessions on one map: {world}"
+    first, second = f"{world} from frame 0", f"{world} from frame 100"
     assert odometry[0] == f"odometry of {second}"
     assert names[:2] == [first, second]
 
