@@ -294,15 +294,22 @@ def respond_into(
 ) -> None:  # fmt: skip
     """Write what :func:`place_response` gives for all cells of one animal into ``out``.
 
-    Responses below 2e-8 are 0. A product in single precision, which is fast, finds the cells that
-    may respond more; only of these the response is computed, in double precision.
+    Responses below 2e-8 are 0 if another is above. A product in single precision, which is fast,
+    finds the cells that may respond more; only of these the response is computed, in double
+    precision.
     """
     square, last = 0.0, grid.size - grid.size % 4
     for k in range(grid.size):
         square += np.float64(grid[k]) * grid[k]
     scale, n = 1.0 / max(math.sqrt(square), 1e-12), n_cells[0]
-    near = np.empty(_ROOM)
-    for first in range(0, n, _ROOM):  # cells that were recruited one after the other lie together
+    near, silent, any_responds = np.empty(_ROOM), _SILENT, False
+    blocks = (n + _ROOM - 1) // _ROOM
+    for block in range(2 * blocks):  # of cells that were recruited one after the other
+        if block == blocks:
+            if any_responds:
+                break
+            silent = -np.inf  # all are weak: again, with those that are hardly alike
+        first = block % blocks * _ROOM
         size, closest = min(_ROOM, n - first), -np.inf
         for i in range(size):
             dx = centres_m[0, first + i, 0] - position_m[0]
@@ -315,7 +322,9 @@ def respond_into(
         alike = np.dot(weights[0, first : first + size], grid)
         for i in range(size):
             # ln s <= s - 1; the margin is above the rounding of single precision
-            if power * (min(alike[i] * scale, 1.0) - 1.0 + 1e-5) + near[i] < _SILENT:
+            if near[i] < _SILENT or (
+                power * (min(alike[i] * scale, 1.0) - 1.0 + 1e-5) + near[i] < silent
+            ):
                 continue
             a = b = c = d = 0.0
             w = weights[0, first + i]
@@ -327,8 +336,9 @@ def respond_into(
             for k in range(last, grid.size):
                 a += w[k] * np.float64(grid[k])
             similarity = ((a + b) + (c + d)) * scale
-            if similarity > 0.0 and power * (min(similarity, 1.0) - 1.0) + near[i] >= _SILENT:
+            if similarity > 0.0 and power * (min(similarity, 1.0) - 1.0) + near[i] >= silent:
                 out[first + i] = similarity**power * math.exp(near[i])
+                any_responds = True
 
 
 @compiled

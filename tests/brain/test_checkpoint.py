@@ -208,7 +208,7 @@ def test_a_brain_of_the_first_format_is_one_session(brain, tmp_path):
         for name, tensor in tensors.items()
         if not name.startswith(("sessions.", "recognition.", "map.aliases."))
         and name not in ("map.experiences.session", "map.experiences.number")
-        and name not in ("map.state.session", "map.state.made")
+        and name not in ("map.state.session", "map.state.made", "continuity.state.recent")
     }
     n_blocks = brain.view.geometry.n_blocks
     old["view.templates.blocks"] = old["view.templates.blocks"][:, :n_blocks].contiguous()
@@ -220,6 +220,7 @@ def test_a_brain_of_the_first_format_is_one_session(brain, tmp_path):
     state = loaded.state_dict()
     for name in old:
         assert torch.equal(state[name], tensors[name]), name
+    assert state["continuity.state.recent"] == 0.0  # as after a calm drive
     origins = loaded.map.origins()
     assert origins.number.tolist() == list(range(brain.map.n))
     assert set(origins.session.tolist()) == {loaded.sessions.now.id}

@@ -395,7 +395,7 @@ def test_plot_draws_the_map_again_and_two_more(whole, tmp_path):
 @pytest.mark.parametrize(
     ("cells", "figures"),
     [
-        (["place"], ["place_cells.png"]),
+        (["place"], ["place_cells.png", "cells_grid.png", "cells_place.png", "raster.png"]),
         (["semantic"], []),
         (["pose", "place"], ["pose_cells.png", "place_cells.png"]),
     ],
