@@ -10,6 +10,7 @@ import torch
 from neuroslam.brain.forgetting import forget
 from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame, SourceError, first_line
+from neuroslam.odometry.flow import FlowOdometry, Picture
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
     check_image,
@@ -45,7 +46,7 @@ class Accepted(NamedTuple):
         observed: Observation of each population, by kind.
         velocity: Self-motion, measured or from visual odometry.
         dt_s: Time since the last frame.
-        profiles: Profiles for the visual odometry of the next frame; ``None``: not used.
+        profiles: What the visual odometry of the next frame needs; ``None``: not used.
         gap: The time since the last frame exceeds ``max_gap_s``: a new map begins.
     """
 
@@ -54,7 +55,7 @@ class Accepted(NamedTuple):
     observed: dict[str, Any]
     velocity: Velocity
     dt_s: float
-    profiles: Profiles | None
+    profiles: Profiles | Picture | None
     gap: bool
 
 
@@ -191,7 +192,7 @@ class NavigationBrain(BrainState):
         """Begin a frame: start a new map after a gap or a kidnapping, and match the view."""
         frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
         if accepted.profiles is not None:
-            self.odometry.remember(accepted.profiles)
+            self.odometry.remember(accepted.profiles)  # type: ignore[arg-type]
         gap = accepted.gap
         change, broken = (0.0, False) if view is None else self.continuity.compare(view)
         alarm = broken and self._detects
@@ -337,8 +338,11 @@ class NavigationBrain(BrainState):
             )
         return float(dt_s)
 
-    def _velocity(self, frame: Frame, dt_s: float) -> tuple[Velocity, Profiles | None]:
+    def _velocity(self, frame: Frame, dt_s: float) -> tuple[Velocity, Profiles | Picture | None]:
         use = self.config.odometry.use
+        if use == "fused" and frame.image is not None and isinstance(self.odometry, FlowOdometry):
+            given = None if frame.velocity is None else checked_odometry(frame.velocity)
+            return self.odometry.measure(frame.image, dt_s, given)
         if use != "visual" and frame.velocity is not None:
             return checked_odometry(frame.velocity), None
         if use == "given" or frame.image is None:

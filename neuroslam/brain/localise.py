@@ -28,7 +28,7 @@ from neuroslam.geometry import compose, compose_poses, integrate_velocities, rel
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.sequence import advance_costs, relative_errors, within_links
 from neuroslam.merging.limits import WINDOW, tolerance
-from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.odometry import FlowOdometry, visual_odometry
 from neuroslam.sensors.frames import check_instant, checked_odometry
 from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Frame, Pose
 from neuroslam.view.sequence import standardised
@@ -210,7 +210,7 @@ class Localiser:
         from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
         self._tree = cKDTree(self._points)
-        self._odometry = VisualOdometry(self.config.odometry, self.config.view.grey)
+        self._odometry = visual_odometry(self.config.odometry, self.config.view.grey)
         self._path: deque[_Seen] = deque(maxlen=FRAMES)
         share = LINKS_LARGEST_SHARE[bool(self.config.view.orientations)]
         self._links = _LinkEvidence(brain.map, share)
@@ -260,7 +260,10 @@ class Localiser:
             if not dt_s > 0.0:
                 raise BadFrame(f"time {frame.time_s} s does not follow {self._time_s} s")
         use = self.config.odometry.use
-        if use != "visual" and frame.velocity is not None:
+        if use == "fused" and frame.image is not None and isinstance(self._odometry, FlowOdometry):
+            given = None if frame.velocity is None else checked_odometry(frame.velocity)
+            velocity = self._odometry(frame.image, dt_s, given)
+        elif use != "visual" and frame.velocity is not None:
             velocity = checked_odometry(frame.velocity)
         elif use == "given" or frame.image is None:
             raise BadFrame("no odometry in the source, and no image to measure it by")

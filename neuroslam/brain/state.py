@@ -26,7 +26,7 @@ from neuroslam.merging.mapped import counts_of, differing
 from neuroslam.merging.match import shared_history
 from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
-from neuroslam.odometry.visual import VisualOdometry
+from neuroslam.odometry import FlowOdometry, VisualOdometry, visual_odometry
 from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, QuickModule, State
@@ -74,7 +74,7 @@ class BrainState(QuickModule):
 
     half_taken: str
     clock: Clock
-    odometry: VisualOdometry
+    odometry: VisualOdometry | FlowOdometry
     view: LocalViewCells
     map: ExperienceMap
     # Populations of the package, if config.cells names them:
@@ -155,7 +155,7 @@ class BrainState(QuickModule):
     def _begin(self) -> None:
         """Start with an empty map."""
         config, cells = self.config, self.config.pose_cells
-        self.odometry = VisualOdometry(config.odometry, config.view.grey)
+        self.odometry = visual_odometry(config.odometry, config.view.grey)
         self.view = LocalViewCells(config.view, self._encoder)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells

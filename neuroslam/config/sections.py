@@ -28,12 +28,54 @@ def region_in(region: Region, height: int, width: int) -> Region:
 
 
 class OdometryConfig(Section):
-    """Visual odometry: speed and turn rate from two regions of successive images."""
+    """Visual odometry: speed and turn rate from successive images."""
 
-    use: Literal["auto", "visual", "given"] = Field(
+    use: Literal["auto", "visual", "given", "fused"] = Field(
         default="auto",
         description="source of odometry; auto: the source's own where it has one, else visual "
-        "odometry; visual: always from the images; given: always the source's own",
+        "odometry; visual: always from the images; given: always the source's own; fused: both, "
+        "weighted by their variances, where method is flow",
+    )
+    method: Literal["profiles", "flow"] = Field(
+        default="profiles",
+        description="how images measure motion; profiles: the column sums of two regions are "
+        "shifted over those before, as in RatSLAM; flow: corners are followed, and most of them "
+        "have to agree",
+    )
+    camera_height_m: float | None = Field(
+        default=None,
+        gt=0,
+        le=100,
+        description="flow: height of the camera above a flat floor, in m, for speeds in metres; "
+        "none: the unit of length is the height of the camera",
+    )
+    camera_tilt_deg: float = Field(
+        default=0.0,
+        ge=-60,
+        le=89,
+        description="flow: tilt of the camera downwards from the horizontal, in degrees; larger: "
+        "the same flow of the floor is a lower speed",
+    )
+    given_speed_error: float = Field(
+        default=0.05,
+        gt=0,
+        le=1,
+        description="fused: standard deviation of the source's speed as a share of it; larger: the "
+        "images count more",
+    )
+    given_turn_error_rad_s: float = Field(
+        default=0.05,
+        gt=0,
+        le=10,
+        description="fused: standard deviation of the source's turn rate in rad/s; larger: the "
+        "images count more",
+    )
+    gyroscope_error_rad_s: float = Field(
+        default=0.01,
+        gt=0,
+        le=10,
+        description="fused: standard deviation of a gyroscope's turn rate in rad/s, its bias "
+        "included; larger: the images count more",
     )
     speed_region: Region | None = Field(
         default=None,
@@ -78,6 +120,12 @@ class OdometryConfig(Section):
         description="what the first image is compared with; still: nothing, the speed is 0; "
         "zero_profile: an all-zero profile, as in OpenRatSLAM",
     )
+
+    @model_validator(mode="after")
+    def _check_method(self) -> Self:
+        if self.use == "fused" and self.method != "flow":
+            raise ValueError("use = 'fused' needs method = 'flow': profiles have no variance")
+        return self
 
 
 class ViewConfig(Section):

@@ -10,7 +10,7 @@ import numpy as np
 
 from neuroslam.config import BrainConfig
 from neuroslam.errors import BadFrame, RunError, SourceError, counted
-from neuroslam.odometry import VisualOdometry
+from neuroslam.odometry import visual_odometry
 from neuroslam.sensors import Source, open_source
 from neuroslam.sensors.open import pair_of, with_offset
 from neuroslam.sensors.tracks import time_text
@@ -371,7 +371,7 @@ def _correlation_at(seen: Turns, measured: Turns, offset_s: float) -> float:
 
 
 def _seen(camera: Source, config: BrainConfig) -> Turns:
-    odometry = VisualOdometry(config.odometry, config.view.grey)
+    odometry = visual_odometry(config.odometry, config.view.grey)
     times, turned, moved = [], [], []
     for frame in camera.frames(on_bad_frame=lambda _: None):
         if frame.image is None or (times and not frame.time_s > times[-1]):
