@@ -102,13 +102,13 @@ def follow_corners(before: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.
     for top, part in ((0, before[:middle]), (middle, before[middle:])):
         corners = cv2.goodFeaturesToTrack(part, _CORNERS, 0.01, distance, blockSize=5)
         if corners is not None:
-            found.append(corners.reshape(-1, 2) + np.float32([0.0, top]))
+            found.append(corners.reshape(-1, 2) + np.array([0.0, top], np.float32))
     if not found:
         return np.empty((0, 2)), np.empty((0, 2))
     start = np.concatenate(found).astype(np.float32)[:, None]
     window = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": _LEVELS}
-    end, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, **window)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, end, None, **window)
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, start.copy(), **window)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, end, end.copy(), **window)
     kept = (there[:, 0] == 1) & (again[:, 0] == 1)
     kept &= np.hypot(*(back - start)[:, 0].T) < _BACK_PX
     kept &= ((end[:, 0] >= 0) & (end[:, 0] <= np.array(now.shape)[::-1] - 1)).all(axis=1)
@@ -318,9 +318,9 @@ class FlowOdometry(AboutNow):
         a, b = follow_corners(self.image.numpy(force=True), grey)
         if len(a) < _FEWEST:
             return None
-        rays = [level_rays(p, grey.shape, c.fov_deg, c.camera_tilt_deg) for p in (a, b)]
+        before, now = (level_rays(p, grey.shape, c.fov_deg, c.camera_tilt_deg) for p in (a, b))
         pixel_rad = _PIXEL_ERROR * math.radians(c.fov_deg) / grey.shape[1]
-        turn = turn_of_rays(*rays, pixel_rad)
+        turn = turn_of_rays(before, now, pixel_rad)
         if turn is None:
             return None
         forward = None
