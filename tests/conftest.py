@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from neuroslam.cli import main
+from neuroslam.cli import main, progress
 
 # Imports and collected tests make a million objects, none of them garbage: Python searches them for
 # reference cycles again and again, in a tenth of the time of all tests.
@@ -22,6 +22,10 @@ settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("any machine")
+
+
+# A command that takes long on a slow machine prints lines of progress; tests compare what it says.
+progress.EVERY_S = 3600.0
 
 
 def pytest_collection_finish() -> None:

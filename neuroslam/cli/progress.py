@@ -23,16 +23,19 @@ if TYPE_CHECKING:
 EVERY_S = 10.0
 """Seconds between two lines of progress without a terminal."""
 
+_RECENT_S = 10.0
+"""Time over which the rate is measured."""
+
 
 class _Rate:
-    """Rate over the last ten seconds, or since the start: what came before may have been slower."""
+    """Rate over the last seconds, or since the start: what came before may have been slower."""
 
     def __init__(self) -> None:
         self.points = deque([(time.monotonic(), 0)], maxlen=51)
 
     def __call__(self, now: float, done: int) -> float:
         self.points.append((now, done))
-        while len(self.points) > 2 and now - self.points[1][0] >= EVERY_S:
+        while len(self.points) > 2 and now - self.points[1][0] >= _RECENT_S:
             self.points.popleft()
         began, before = self.points[0]
         return (done - before) / max(now - began, 1e-9)
