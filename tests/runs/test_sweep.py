@@ -211,7 +211,8 @@ def test_a_local_ray_of_two_workers_gives_the_files_of_one_after_the_other(seria
         while running.poll() is None:
             listening |= addresses_of(running.pid)
             time.sleep(0.2)
-        assert (running.returncode, running.stderr.read()) == (0, "")
+        said = [line for line in running.stderr.read().splitlines() if "elapsed" not in line]
+        assert (running.returncode, said) == (0, [])  # but progress, if the machine is slow
     if listening:  # psutil is installed
         assert listening <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
     assert digests(out) == digests(serial[0])
