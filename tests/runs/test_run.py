@@ -231,7 +231,8 @@ def test_a_run_goes_on_in_a_new_process_after_one_was_killed(whole, cut_copy):
     (cut_copy / "frames.csv").write_bytes(frames + extra + extra[:20])
     trace = (cut_copy / "trace.f64").read_bytes()
     (cut_copy / "trace.f64").write_bytes(trace + trace[: 5 * 8 * len(TRACE_COLUMNS) + 3])
-    command = [sys.executable, "-m", "neuroslam.cli", "resume", cut_copy, "--no-tensorboard"]
+    command = [sys.executable, "-m", "neuroslam.cli", "resume", cut_copy, "--quiet"]
+    command.append("--no-tensorboard")
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert_equal_runs(whole[0], cut_copy)
