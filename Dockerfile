@@ -1,8 +1,7 @@
 # CPU image: docker build -t neuroslam .
 #            docker run --rm -v "$PWD/out:/out" neuroslam                     # the demo
 #            docker run --rm -v "$PWD:/out" neuroslam run drive.mp4 -o mapped # your video
-# PIP_ARGS goes to pip, for example the index of PyTorch's CPU builds (--extra-index-url ...):
-# without it Linux gets the CUDA libraries too.
+# PIP_ARGS goes to pip: without the choice of a CPU build of torch Linux gets the CUDA libraries too.
 FROM python:3.11-slim
 
 ARG PIP_ARGS=""

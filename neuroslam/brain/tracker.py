@@ -313,7 +313,7 @@ class SequenceTracker(Mergeable):
         jump = self._jumped(compared, around, map_)
         if jump != NO_EXPERIENCE:
             return self._correct(jump, elsewhere[best], costs[here], map_)
-        if self._carried_away(around, current):
+        if self._kidnapped(around, current):
             s.mode, s.bad, s.doubts = Mode.SEARCHES, 0, c.doubt_frames
             self.evidence.array("cost")[:] = self.evidence.array("fresh")
             return Tracking("wait", current, -costs[here], -elsewhere[best])
@@ -398,7 +398,7 @@ class SequenceTracker(Mergeable):
         self.evidence.array("cost")[:] = self.evidence.array("fresh")
         return best
 
-    def _carried_away(self, around: _Around, current: int) -> bool:
+    def _kidnapped(self, around: _Around, current: int) -> bool:
         """Return whether no frame since an abrupt change fits the places where the robot was."""
         s = self.state
         if s.doubts:

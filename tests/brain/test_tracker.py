@@ -156,7 +156,7 @@ def alert():
         yield robot
 
 
-def test_a_tracked_robot_that_is_carried_to_an_unknown_place_begins_a_new_map(alert):
+def test_a_tracked_robot_that_is_kidnapped_to_an_unknown_place_begins_a_new_map(alert):
     robot, first = copy.deepcopy(alert), 3 * LAP
     for frame in drive(laps(1.0) / 3, strip(5, 7200), first):
         robot(frame)
@@ -168,7 +168,7 @@ def test_a_tracked_robot_that_is_carried_to_an_unknown_place_begins_a_new_map(al
     assert began <= config.doubt_frames + config.search_frames + 5
 
 
-def test_a_robot_that_is_carried_off_and_back_soon_stays_on_its_map(alert):
+def test_a_robot_that_is_kidnapped_and_back_soon_stays_on_its_map(alert):
     robot = copy.deepcopy(alert)
     away = list(drive(laps(0.2) / 3, strip(5, 7200), first=3 * LAP))
     back = list(drive(laps(0.5), first=3 * LAP + len(away)))
