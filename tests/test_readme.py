@@ -98,7 +98,8 @@ def test_the_table_is_found():
 @pytest.mark.parametrize("page", PAGES)
 def test_every_dotted_name_leads_to_something(page):
     text = (ROOT / page).read_text()
-    for name in set(re.findall(r"(?<![\w/.-])neuroslam(?:\.[A-Za-z_]\w*)+", text)):
+    files = {path.name for path in ROOT.glob("examples/*/*")}  # neuroslam.launch
+    for name in set(re.findall(r"(?<![\w/.-])neuroslam(?:\.[A-Za-z_]\w*)+", text)) - files:
         assert name == ENTRY_POINTS or resolve(name) is not None, name
 
 

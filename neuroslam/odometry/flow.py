@@ -93,8 +93,8 @@ def follow_corners(before: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.
         >>> image = np.random.default_rng(0).integers(0, 255, (60, 80)).astype(np.uint8)
         >>> image = cv2.GaussianBlur(image, (0, 0), 2.0)
         >>> a, b = follow_corners(image, np.roll(image, 2, axis=1))
-        >>> np.median(b - a, axis=0).round(1).tolist()
-        [2.0, 0.0]
+        >>> bool(np.allclose(np.median(b - a, axis=0), [2.0, 0.0], atol=0.05))
+        True
     """
     middle = before.shape[0] // 2
     distance = max(2.0, before.shape[1] / 40.0)
@@ -237,8 +237,9 @@ class FlowOdometry(AboutNow):
         >>> from neuroslam.sensors import open_source
         >>> odometry = FlowOdometry(OdometryConfig(method="flow", camera_height_m=1.1))
         >>> frames = open_source("world:corridor").frames(stop=3)
-        >>> [round(odometry(frame.image, 0.1).v_m_s, 1) for frame in frames]
-        [0.0, 1.0, 1.0]
+        >>> speeds = [odometry(frame.image, 0.1).v_m_s for frame in frames]  # it drives 1 m/s
+        >>> bool(np.allclose(speeds, [0.0, 1.0, 1.0], atol=0.2))
+        True
     """
 
     image: Tensor

@@ -292,16 +292,17 @@ def test_layers_and_colours_change_what_is_drawn(page):
 
 def test_the_planned_path_is_drawn(show, runs, tmp_path):
     out = shutil.copytree(runs / "second", tmp_path / "out")
-    assert write_report(out) == out / "report.html"
-    without = picture(show(out / "report.html"))
+    assert show(write_report(out)).locator("[data-layer=plan]").count() == 0
     plan(out, "3", start="20")
     page = show(write_report(out))
-    drawn = picture(page)
-    assert changed(drawn, without) > 200
     assert "planned path" in page.locator("#legend").inner_text()
     page.locator(".layers summary").click()
+    drawn = picture(page)
     page.locator("[data-layer=plan]").uncheck()
-    assert changed(picture(page), without) == 0
+    without = picture(page)
+    assert changed(drawn, without) > 200
+    page.locator("[data-layer=plan]").check()
+    assert changed(picture(page), drawn) == 0
 
 
 def test_only_what_differs_can_be_shown_of_the_config(page):
