@@ -563,7 +563,8 @@ class NavigationCells(Population):
             rows = buffers["boundary"], buffers["grid"], buffers["place"]
         except KeyError:  # not all are recorded
             return False
-        n = place.record_compiled(row, *arrays, *rows)
+        felt, grid, at = arrays
+        n = place.record_compiled(row, felt, grid, at, *rows)
         if n >= 0:
             widths["place"] = n
         return n >= 0
@@ -595,16 +596,17 @@ class NavigationCells(Population):
             ``None`` where the steps are not compiled.
         """
         felt, grid = self.boundary._buffers["rates"], self.grid._buffers["rates"]
-        at, kept = self.oscillators._buffers["position_m"], self.__dict__.get("_arrays")
+        at, kept = self.oscillators._buffers["position_m"], vars(self).get("_arrays")
         if kept is not None:
             tensors = kept[0]
             if tensors[0] is felt and tensors[1] is grid and tensors[2] is at:
-                return cast(Arrays, kept[1])
+                return kept[1]
         if not self._compiles():
             return None
-        kept = (felt, grid, at), tuple(cast(Tensor, one).numpy() for one in (felt, grid, at))
-        self.__dict__["_arrays"] = kept
-        return kept[1]
+        tensors = cast(tuple[Tensor, Tensor, Tensor], (felt, grid, at))
+        arrays = tensors[0].numpy(), tensors[1].numpy(), tensors[2].numpy()
+        vars(self)["_arrays"] = tensors, arrays
+        return arrays
 
     def cell_properties(self) -> dict[str, dict[str, np.ndarray]]:
         """Return bearing and distance of boundary cells, the spacings of grid cells, and centres.

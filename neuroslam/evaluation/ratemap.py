@@ -185,7 +185,8 @@ class RateMaps:
             wide = np.pad(visited, closing_bins)  # else the edge of the map would be a gap
             square = np.ones((3, 3), bool)
             closed = ndimage.binary_closing(wide, square, iterations=closing_bins)
-            visited |= closed[closing_bins:-closing_bins, closing_bins:-closing_bins]
+            inner = slice(closing_bins, -closing_bins)
+            visited = visited | np.asarray(closed, dtype=bool)[inner, inner]
         sums, counts = self.sums, self.counts
         if sigma_bins > 0.0:
             from scipy import ndimage

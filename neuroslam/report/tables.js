@@ -183,5 +183,9 @@ function showLegend() {
   if (layers.merges.on) add("key-ring", colour(colours.match), "merge points");
   if (layers.walls.on) add("key-line", { borderColor: colours.wall, borderTopWidth: "3px" }, "remembered walls");
   if (layers.landmarks.on) add("key-dot", { background: colours.landmark }, "landmarks");
-  $("legend").replaceChildren(...items);
+  const legend = $("legend"), { width, height } = legend.getBoundingClientRect();
+  legend.replaceChildren(...items);
+  // A layer switched off shortens the legend: without this the map would jump.
+  legend.style.minHeight = legend.keptWidth === width ? `${height}px` : "";
+  legend.keptWidth = width;
 }

@@ -201,7 +201,8 @@ class MappingNode:
 
     def _step(self, instant: Instant) -> list[Output]:
         self._events.clear()
-        motion = None if instant.velocity is None else tuple(instant.velocity)
+        given = instant.velocity
+        motion = None if given is None else (given.v_m_s, given.w_rad_s)
         here = self.robot.step(instant.image, instant.time_s, motion, instant.ranges)
         brain, frame, time_s = self.robot.brain, self.settings.map_frame, instant.time_s
         origin = brain.map.origin

@@ -35,8 +35,8 @@ class Ros1Shell:
     """
 
     def __init__(self, rospy: Any) -> None:  # noqa: ANN401
-        from nav_msgs.srv import GetPlan, GetPlanResponse
-        from std_srvs.srv import Trigger, TriggerResponse
+        from nav_msgs.srv import GetPlan, GetPlanResponse  # pyright: ignore[reportMissingImports]
+        from std_srvs.srv import Trigger, TriggerResponse  # pyright: ignore[reportMissingImports]
 
         self.rospy = rospy
         self._in_order = threading.Lock()  # each topic has a thread of its own
@@ -115,7 +115,7 @@ def _trigger(service: Callable[[], Answer], response: Any) -> Callable[[Any], An
 def main() -> int:
     """Run the node until ROS shuts down; the map is saved then. Return 2 for a user's mistake."""
     try:
-        import rospy
+        import rospy  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         print(f"neuroslam: needs ROS 1 ({error}); source its setup.bash first")
         return 2

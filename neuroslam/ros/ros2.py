@@ -33,15 +33,15 @@ class Ros2Shell:
     """
 
     def __init__(self, ros: Any) -> None:  # noqa: ANN401
-        from builtin_interfaces.msg import Time
-        from nav_msgs.srv import GetPlan
-        from rclpy.qos import (
+        from builtin_interfaces.msg import Time  # pyright: ignore[reportMissingImports]
+        from nav_msgs.srv import GetPlan  # pyright: ignore[reportMissingImports]
+        from rclpy.qos import (  # pyright: ignore[reportMissingImports]
             DurabilityPolicy,
             HistoryPolicy,
             QoSProfile,
             ReliabilityPolicy,
         )
-        from std_srvs.srv import Trigger
+        from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
 
         self.ros = ros
         types = import_types()
@@ -124,8 +124,8 @@ def _trigger(service: Callable[[], Answer]) -> Callable[[Any, Any], Any]:
 def main(args: list[str] | None = None) -> int:
     """Run the node until ROS shuts down; the map is saved then. Return 2 for a user's mistake."""
     try:
-        import rclpy
-        from rclpy.executors import ExternalShutdownException
+        import rclpy  # pyright: ignore[reportMissingImports]
+        from rclpy.executors import ExternalShutdownException  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         print(f"neuroslam: needs ROS 2 ({error}); source its setup.bash first")
         return 2

@@ -211,7 +211,7 @@ def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = Non
     frames, actions, trace = read_frames(run, rows), read_actions(run, rows), read_trace(run, rows)
     brain = brain.largest
     poses = trajectory(brain, trace)
-    known = np.isfinite(poses).all(axis=1)
+    known = [all(map(math.isfinite, pose)) for pose in poses.tolist()]
     times_s = frames["time_s"]
     notes: list[str] = []
 

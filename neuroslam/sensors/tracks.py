@@ -350,7 +350,7 @@ def parse_table(
     return Table(table, rows, notes)
 
 
-def separator_note(header: list[str]) -> str:
+def separator_note(header: Sequence[str]) -> str:
     """Return what to do about a header that other characters than commas separate."""
     for mark, what in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
         if len(header) == 1 and len(header[0].strip().split(mark)) > 1:

@@ -471,12 +471,11 @@ class SSPSLAM(BufferModule):
         )  # fmt: skip
         now = np.empty((self.batch, 5), dtype=kind)
         learns, plasticity = (np.empty(self.batch, dtype=kind) for _ in range(2))
-        encode_, before, between, after, multiply, filter_ = (
-            each.dispatcher()
-            for each in (
-                encode_each, before_recalls, fourier_of_recalls, after_recalls, times,
-                filter_into,
-            )
+        encode_, multiply, filter_ = (
+            encode_each.dispatcher(), times.dispatcher(), filter_into.dispatcher()
+        )  # fmt: skip
+        before, between, after = (
+            before_recalls.dispatcher(), fourier_of_recalls.dispatcher(), after_recalls.dispatcher()
         )  # fmt: skip
 
         def step(

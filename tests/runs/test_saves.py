@@ -298,6 +298,8 @@ def test_a_reader_waits_for_a_save_in_progress_and_not_for_ever(tmp_path, monkey
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_saves_the_run_as_ctrl_c_does(number, tmp_path, says):
     before = signal.getsignal(number)
+    if before == signal.SIG_IGN:
+        pytest.skip(f"{number.name} is ignored here, as under nohup")
 
     def press(result):
         if result.frame in (5, 6):  # a second one does not break the save

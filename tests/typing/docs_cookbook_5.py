@@ -10,4 +10,4 @@ bins = Bins(-0.5, -0.5, 10, 10, 0.1)
 for name in ("boundary", "grid"):
     maps = [rate_map(log.position_m, log[name], bins) for log in logs]
     both = np.isfinite(maps[0][0]) & np.isfinite(maps[1][0])
-    print(name, "cells", np.corrcoef(*(one[:, both].ravel() for one in maps))[0, 1])
+    print(name, "cells", np.corrcoef([one[:, both].ravel() for one in maps])[0, 1])
