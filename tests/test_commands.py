@@ -25,7 +25,7 @@ WORLD = "world:corridor?frames_per_lap=110&laps=1.4&width=160&height=120&grey=tr
 SESSIONS = ("drive", "monday", "tuesday", "wednesday", "friday")
 SHORT = {"world:": "40", "arena:": "200"}
 """Rendered worlds and arenas run for so many frames only, for the sake of time."""
-MERGED = "2000"
+MERGED = "1200"
 """Frames of an arena whose map is merged: until enough of its walls are known."""
 
 
@@ -70,9 +70,9 @@ def inputs(tmp_path_factory):
     (home / "orb_slam.tum").write_text("\n".join(camera_axes) + "\n")
     (home / "landmarks.csv").write_text("kind,number,name,words,corners\n,0,DOOR,BLUE * DOOR,\n")
     (home / "truth.tum").write_text("\n".join(poses) + "\n")
-    angle = np.linspace(0.0, 20.0, 1500)
+    angle = np.linspace(0.0, 5.0, 400)
     walk = 0.5 * np.column_stack([np.cos(angle), np.sin(0.7 * angle)])
-    np.savez(home / "rat.npz", t=0.05 * np.arange(1500), pos=walk, arena_radius=1.0)
+    np.savez(home / "rat.npz", t=0.05 * np.arange(len(angle)), pos=walk, arena_radius=1.0)
     facing = np.degrees(np.arctan2(*np.gradient(walk, axis=0).T[::-1]))
     track = [
         f"{50 * k},{100 * x},{100 * y},{hd}"
@@ -175,7 +175,7 @@ def test_every_command_of_a_page_runs_as_printed(page, inputs, tmp_path, monkeyp
         write_bag(tmp_path / "drive.bag", list(open_source(WORLD).frames(0, 60)))
     if "session.nwb" in page.read_text():
         pytest.importorskip("pynwb", reason="needs the extra neuro")
-        log = record("arena:square?minutes=0.5", only=["grid"])
+        log = record("arena:square?minutes=0.3", only=["grid"])
         log.to_nwb(tmp_path / "session.nwb")
     merged = {map_ for line in commands(page) for map_ in line.split()[2:4] if " merge " in line}
     for line in commands(page):

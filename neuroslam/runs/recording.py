@@ -88,6 +88,8 @@ class TensorBoardRecorder(Recorder):
         maps_every: Frames between two drawings of the map, the slowest part (0.1 s); the first ones
             are after 50, 100, 200, ... frames.
         projected: Most templates, evenly sampled, for the projector.
+        panels_share: Part of the time of a run that the panels of cells may take before its end;
+            drawing them once takes about a second.
 
     Raises:
         RunError: If the folder cannot be written.
@@ -100,6 +102,7 @@ class TensorBoardRecorder(Recorder):
         images_every: int = 200,
         maps_every: int = 1000,
         projected: int = 2000,
+        panels_share: float = 0.1,
     ) -> None:
         from torch.utils.tensorboard import SummaryWriter  # slow to import, not always needed
 
@@ -107,14 +110,17 @@ class TensorBoardRecorder(Recorder):
         self.images_every = images_every
         self.maps_every = maps_every
         self.projected = projected
+        self.panels_share = panels_share
         self._last: tuple[int, NavigationBrain] | None = None
         self._drawn = -1
         self._clock = (time.perf_counter(), 0)
+        self._begun_s = self._clock[0]
         self._seen = 0
         self._measured = False
         self._panels: dict[str, Panels] = {}
         self._map_due = min(maps_every, _FIRST_MAP)  # frames seen
         self._panels_due = 0  # the same
+        self._drawing_s = 1.0  # of all panels so far, and the first
         try:
             self._writer = SummaryWriter(str(folder), max_queue=1000)  # short queues block the loop
         except OSError as error:
@@ -197,10 +203,13 @@ class TensorBoardRecorder(Recorder):
             unit="m" if self._measured else "arbitrary unit",
         )
         self._write_picture("map/experiences_and_links", render(figure), frame)
-        if last or self._seen >= self._panels_due:
+        now_s = time.perf_counter()
+        affordable = self._drawing_s <= self.panels_share * (now_s - self._begun_s)
+        if last or (self._seen >= self._panels_due and affordable):
             self._panels_due = self._seen + self._seen // 2
             for panels in self._panels.values():
                 panels.write_figures(frame)
+            self._drawing_s += time.perf_counter() - now_s
         self._drawn = frame
 
     def _write_picture(self, tag: str, picture: np.ndarray, frame: int) -> None:

@@ -1,4 +1,5 @@
 import io
+import math
 
 import cv2
 import numpy as np
@@ -127,7 +128,7 @@ def test_of_many_templates_the_projector_gets_an_even_choice(tmp_path):
 def test_panels_can_be_seen_while_a_run_goes_on(tmp_path):
     over = {"wall_memory": {"senses": "boundary_cells"}, "place_cells": {"excitation": 0.5}}
     brain = NavigationBrain(build_config(merge_values(read_preset("slrb"), over)))
-    with TensorBoardRecorder(tmp_path) as recorder:
+    with TensorBoardRecorder(tmp_path, panels_share=math.inf) as recorder:
         for frame in open_source("arena:square?minutes=0.2&noise=1&ranges=60").frames(0, 120):
             recorder.step(brain(frame), frame, brain)
         events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
@@ -139,6 +140,17 @@ def test_panels_can_be_seen_while_a_run_goes_on(tmp_path):
     assert all([drawn.step for drawn in each] == [50, 100] for each in images.values())
     for tag in ("cells/place_bump", "cells/boundary_cells"):
         assert pixels(images[tag][-1]).std() > 10.0
+
+
+def test_panels_wait_until_a_run_is_long_enough_for_them(tmp_path):
+    brain = NavigationBrain(build_config(read_preset("slrb")))
+    with TensorBoardRecorder(tmp_path) as recorder:
+        for frame in open_source("arena:square?minutes=0.1&noise=1").frames(0, 110):
+            recorder.step(brain(frame), frame, brain)
+    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
+    events.Reload()
+    assert [drawn.step for drawn in events.Images("cells/place_map")] == [109]  # at the end
+    assert [drawn.step for drawn in events.Images("map/experiences_and_links")] == [50, 100, 109]
 
 
 def test_a_brain_of_boundary_grid_and_place_cells_is_recorded_too(tmp_path):
@@ -180,7 +192,7 @@ def semantic_drive(folder, n, before_each=lambda i, brain: None, **over):
     """A drive past landmarks that is recorded; the brain, its results, and the events."""
     config = merge_values(read_preset("full"), {"cells": "pose+semantic", **over})
     brain, results = NavigationBrain(build_config(config)), []
-    with TensorBoardRecorder(folder, scalars_every=5, maps_every=20) as recorder:
+    with TensorBoardRecorder(folder, 5, maps_every=20, panels_share=math.inf) as recorder:
         for i, frame in enumerate(open_source(LANDMARKS).frames(0, n)):
             before_each(i, brain)
             results.append(brain(frame))
