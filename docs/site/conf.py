@@ -131,7 +131,8 @@ def resolve(
     top = (known or target).partition(".")[0]
     if top != "neuroslam" and (hasattr(builtins, top) or importlib.util.find_spec(top)):
         return content
-    return None
+    written = isinstance(content, nodes.literal)  # by us, as a role
+    return None if written else content  # type variables, aliases, parts of others' types
 
 
 def whole_text(self: GoogleDocstring) -> list[str]:

@@ -18,6 +18,7 @@ IcpMode = Literal["rigid", "similarity"]
 # pairs the error is a parabola in the scale and the best rotation does not depend on it, so the
 # scale clipped to the bound is the best one within it: the error still falls with every step.
 SCALE_FACTOR = 1.5
+"""Largest ratio of the scale of an alignment and the initial one."""
 
 _N_ROTATIONS = 24  # 15 degrees apart: no start is more than 7.5 degrees off
 _N_COARSE_POINTS = 300

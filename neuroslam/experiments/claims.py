@@ -11,6 +11,7 @@ PAPERS = {
     "slrb": "SLRB (2023)",
     "ssp": "SSP-SLAM (2023)",
 }
+"""Titles of the sources, by the key that tables and claims use."""
 
 
 class Claim(NamedTuple):

@@ -227,7 +227,7 @@ class ArenaSource(IndexedSource):
     def frames(
         self, start: int = 0, stop: int | None = None, on_bad_frame: OnBadFrame = None
     ) -> Iterator[Frame]:
-        """Yield the frames ``start <= index < stop``, see :meth:`Source.frames`.
+        """Yield the frames ``start <= index < stop``, see :meth:`.Source.frames`.
 
         If rows of the walk's file were dropped, one bad frame before the first reports it.
         """
