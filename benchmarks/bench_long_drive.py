@@ -15,12 +15,14 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import torch
 
 from benchmarks.bench_memory import MIB, resident_bytes
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
+from neuroslam.figures.style import CURVES, STYLE, new_figure, save
 from neuroslam.threads import limit_threads
 from neuroslam.types import Frame, Velocity
 
@@ -88,26 +90,25 @@ def drive(mode: str, frames: int, cap: int) -> list[dict[str, Any]]:
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw memory, time per frame and the size of the map over frames."""
-    import matplotlib.pyplot as plt
-
     panels = (
-        ("resident memory (MiB)", lambda r: r["resident_bytes"] / MIB),
-        ("CPU time per frame (ms)", lambda r: r["ms_per_frame"]),
-        ("experiences", lambda r: r["experiences"]),
+        ("Memory", "resident memory (MiB)", lambda r: r["resident_bytes"] / MIB),
+        ("Time", "CPU time per frame (ms)", lambda r: r["ms_per_frame"]),
+        ("Map", "experiences", lambda r: r["experiences"]),
     )
-    figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.0), layout="constrained")
-    for axis, (title, value) in zip(axes, panels, strict=True):
-        for mode, color in zip(MODES, ("#1f77b4", "#d95f02"), strict=True):
-            own = [row for row in rows if row["mode"] == mode]
-            axis.plot(
-                [row["frames"] / 1e6 for row in own], [value(row) for row in own],
-                color=color, lw=1.2, label=f"closure by {mode}",
-            )  # fmt: skip
-        axis.set(xlabel="frames (million)", title=title)
-        axis.set_ylim(bottom=0)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].legend(frameon=False, loc="lower right")
-    figure.savefig(path, dpi=110)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(11.0, 3.6, "A long drive under a cap on experiences")
+        axes = figure.subplots(1, 3)
+        for axis, (title, label, value) in zip(axes, panels, strict=True):
+            for mode, colour in zip(MODES, CURVES, strict=False):
+                own = [row for row in rows if row["mode"] == mode]
+                axis.plot(
+                    [row["frames"] / 1e6 for row in own], [value(row) for row in own],
+                    color=colour, lw=1.2, label=f"closure by {mode}",
+                )  # fmt: skip
+            axis.set(xlabel="frames (million)", ylabel=label, title=title)
+            axis.set_ylim(0, 1.15 * max(value(row) for row in rows))
+        axes[0].legend(loc="lower right")
+        save(figure, path)
 
 
 def main() -> None:

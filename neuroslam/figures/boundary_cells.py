@@ -57,7 +57,7 @@ def plot_active_cells(
         np.append(100.0 * distances_m - half_cm, 100.0 * distances_m[-1] + half_cm),
     )
     with mpl.rc_context(STYLE):
-        figure = new_figure(2.6 * len(paths) + 1.0, 2.75 * rows + 0.6, title)
+        figure = new_figure(2.1 * len(paths) + 1.0, 2.35 * rows + 0.6, title)
         axes = figure.subplots(rows, len(paths), squeeze=False, subplot_kw={"projection": "polar"})
         norm = Normalize(0.0, 1.0)
         for row, path in zip(axes.T, paths, strict=True):

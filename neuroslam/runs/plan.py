@@ -48,7 +48,8 @@ def plan(
 
     Raises:
         CheckpointError: If the brain cannot be read.
-        RunError: If start or goal is neither, or no links lead from one to the other.
+        RunError: If start or goal is neither, lies farther from the map than the map is large, or
+            no links lead from one to the other.
     """
     file = brain_file(path)
     brain, out = load_brain(file).largest, Path(file.parent if out is None else out)
@@ -103,6 +104,12 @@ def _experience(brain: NavigationBrain, text: str, what: str) -> tuple[int, floa
             f"{what} {text!r}: expected the id of an experience, such as 12, or a position x,y in "
             "metres, such as 1.5,-2"
         )
-    away = np.hypot(brain.map.poses[:, 0] - x, brain.map.poses[:, 1] - y)
-    nearest = int(away.argmin())
+    at = brain.map.poses[:, :2]
+    away = np.hypot(*(at - (x, y)).T)
+    nearest, size = int(away.argmin()), float(np.hypot(*np.ptp(at, axis=0)))
+    if n > 1 and away[nearest] > size:
+        raise RunError(
+            f"{what} {text}: {away[nearest]:.1f} from the nearest experience, and the map is "
+            f"{size:.1f} from corner to corner; expected a position on the map, in its unit"
+        )
     return nearest, float(away[nearest])

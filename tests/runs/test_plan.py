@@ -47,6 +47,13 @@ def test_a_position_is_the_experience_nearest_to_it(folder, tmp_path):
     assert found.beside_m == pytest.approx(np.hypot(0.02, 0.01))
 
 
+def test_a_position_far_off_the_map_is_refused(folder, tmp_path, call):
+    done = call("plan", folder, "500,500", "-o", tmp_path)
+    assert done.code == 2
+    assert "from the nearest experience, and the map is" in done.err
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_path_back_is_as_long(folder, tmp_path):
     there, back = (plan(folder, b, tmp_path, start=a) for a, b in (("3", "20"), ("20", "3")))
     assert there.path == back.path[::-1]
