@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "view-matching": ("neuroslam.experiments.view_matching", "view_matching", "rtabmap_corridor"),
     "vpr-corridor": (_RECOGNITION, "vpr_corridor", "vpr_corridor"),
     "rtabmap-corridor": (_RECOGNITION, "rtabmap_corridor", "rtabmap_corridor"),
+    "odometry-drift": ("neuroslam.experiments.odometry_drift", "odometry_drift", None),
     "laser-robots": ("neuroslam.experiments.laser_robots", "laser_robots", "radish"),
     "virtual-tour": (_SESSIONS, "virtual_tour", None),
     "virtual-tour-no-shift": (_SESSIONS, "virtual_tour_no_shift", None),
@@ -58,7 +59,7 @@ EXPERIMENTS = {
 }
 """Name -> module, function, and folder of its recordings in the data, or ``None``."""
 
-_OPTIONAL = {"ssp-localisation": "ssp"}
+_OPTIONAL = {"ssp-localisation": "ssp", "odometry-drift": "."}
 """Name -> folder of recordings that are used if present; otherwise random ones are generated."""
 
 
