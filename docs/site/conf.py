@@ -5,6 +5,7 @@ import builtins
 import importlib
 import importlib.util
 import inspect
+import re
 import sys
 from functools import cache
 from pathlib import Path
@@ -131,8 +132,11 @@ def resolve(
     top = (known or target).partition(".")[0]
     if top != "neuroslam" and (hasattr(builtins, top) or importlib.util.find_spec(top)):
         return content
+    last = target.rpartition(".")[2]
+    if last.startswith("_") or re.fullmatch("[A-Z]", last):  # private, or a type variable
+        return content
     written = isinstance(content, nodes.literal)  # by us, as a role
-    return None if written else content  # type variables, aliases, parts of others' types
+    return None if written else content  # aliases, parts of others' types
 
 
 def whole_text(self: GoogleDocstring) -> list[str]:
