@@ -53,6 +53,8 @@ class Frame(NamedTuple):
         landmarks: Visible landmarks, ``(n, 3)``: number (-1 for one without a name), distance in
             metres, bearing in radians relative to the heading.
         truth: Ground-truth pose, if known. Used by evaluation, never by the brain.
+        turn_rate_rad_s: Turn rate by a gyroscope over the interval that ends at this frame,
+            positive to the left; used by ``odometry.use = "fused"``.
     """
 
     index: int  # type: ignore[assignment] # hides tuple.index, which nothing calls
@@ -64,6 +66,7 @@ class Frame(NamedTuple):
     heading_rad: float | None = None
     landmarks: np.ndarray | None = None
     truth: Pose | None = None
+    turn_rate_rad_s: float | None = None
 
 
 class ViewMatch(NamedTuple):

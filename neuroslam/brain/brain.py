@@ -10,7 +10,7 @@ import torch
 from neuroslam.brain.forgetting import forget
 from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame, SourceError, first_line
-from neuroslam.odometry.flow import FlowOdometry, Picture
+from neuroslam.odometry.flow import FlowOdometry, Picture, Reckoned
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
     check_image,
@@ -55,7 +55,7 @@ class Accepted(NamedTuple):
     observed: dict[str, Any]
     velocity: Velocity
     dt_s: float
-    profiles: Profiles | Picture | None
+    profiles: Profiles | Picture | Reckoned | None
     gap: bool
 
 
@@ -338,11 +338,19 @@ class NavigationBrain(BrainState):
             )
         return float(dt_s)
 
-    def _velocity(self, frame: Frame, dt_s: float) -> tuple[Velocity, Profiles | Picture | None]:
+    def _velocity(
+        self, frame: Frame, dt_s: float
+    ) -> tuple[Velocity, Profiles | Picture | Reckoned | None]:
         use = self.config.odometry.use
-        if use == "fused" and frame.image is not None and isinstance(self.odometry, FlowOdometry):
+        if use == "fused" and isinstance(self.odometry, FlowOdometry):
             given = None if frame.velocity is None else checked_odometry(frame.velocity)
-            return self.odometry.measure(frame.image, dt_s, given)
+            gyroscope = frame.turn_rate_rad_s
+            if gyroscope is not None:
+                checked_number(gyroscope, "turn rate", "rad/s")
+            if frame.image is not None:
+                return self.odometry.measure(frame.image, dt_s, given, gyroscope)
+            if given is not None:
+                return self.odometry.reckon(dt_s, given, gyroscope)
         if use != "visual" and frame.velocity is not None:
             return checked_odometry(frame.velocity), None
         if use == "given" or frame.image is None:

@@ -211,8 +211,23 @@ def turn_of_rays(before: np.ndarray, now: np.ndarray, pixel_rad: float) -> Measu
     return agreed(turns[near], np.maximum(sigma[near], 1e-6))
 
 
+class Reckoned(NamedTuple):
+    """Motion at an instant without an image, by wheels and gyroscope.
+
+    Attributes:
+        velocity: Speed and turn rate.
+        dt_s: Time since the instant before.
+    """
+
+    velocity: Velocity
+    dt_s: float
+
+
 class _Before(Scalars):
-    """Size of the images in px, zero before the first; the last motion and the time since."""
+    """Size of the images in px, zero before the first; the last motion and the time since.
+
+    ``reckoned_s``, ``reckoned_m`` and ``reckoned_rad`` add up the instants since the last image.
+    """
 
     height: int
     width: int
@@ -221,6 +236,9 @@ class _Before(Scalars):
     v_sigma: float
     w_sigma: float
     held_s: float
+    reckoned_s: float
+    reckoned_m: float
+    reckoned_rad: float
 
 
 class FlowOdometry(AboutNow):
@@ -249,8 +267,9 @@ class FlowOdometry(AboutNow):
         self.config = config
         self.grey: GreyRule = grey
         self.before = _Before(
-            height=0, width=0, v_m_s=0.0, w_rad_s=0.0, v_sigma=0.0, w_sigma=0.0, held_s=0.0
-        )
+            height=0, width=0, v_m_s=0.0, w_rad_s=0.0, v_sigma=0.0, w_sigma=0.0, held_s=0.0,
+            reckoned_s=0.0, reckoned_m=0.0, reckoned_rad=0.0,
+        )  # fmt: skip
         self.register_buffer("image", torch.zeros((0, 0), dtype=torch.uint8))
         self.register_load_state_dict_pre_hook(_resize_to_saved)
 
@@ -296,7 +315,12 @@ class FlowOdometry(AboutNow):
         given: Velocity | None = None,
         turn_rate_rad_s: float | None = None,
     ) -> tuple[Velocity, Picture]:
-        """Measure the motion as :meth:`forward` does, without changing the state."""
+        """Measure the motion as :meth:`forward` does, without changing the state.
+
+        ``dt_s`` is the time since the last image or :meth:`reckon`. What was reckoned since that
+        image is corrected too: the motion that is returned is that which leads to where the images
+        say that the robot is.
+        """
         if not dt_s > 0.0:
             raise BadFrame(f"FlowOdometry: {dt_s} s since the last image; expected more than 0")
         check_image(image, "FlowOdometry")
@@ -308,10 +332,32 @@ class FlowOdometry(AboutNow):
                 f"{before.width} x {before.height} px as in the frames before it"
             )
         grey, flow = self._reduced(image), None
+        since_s = before.reckoned_s + dt_s
         if before.height:
-            flow = self.flow(grey, dt_s)
-        velocity, held_s, sigma = self._velocity(flow, dt_s, given, turn_rate_rad_s)
-        return velocity, Picture(height, width, grey, velocity, sigma, held_s)
+            flow = self.flow(grey, since_s)
+        wheels = self._wheels(given, turn_rate_rad_s)
+        if before.reckoned_s:
+            moved = before.reckoned_m, before.reckoned_rad
+            wheels = [
+                None if one is None else Measured((done + dt_s * one.value) / since_s, one.sigma)
+                for one, done in zip(wheels, moved, strict=True)
+            ]
+        velocity, held_s, sigma = self._velocity(flow, since_s, *wheels)
+        picture = Picture(height, width, grey, velocity, sigma, held_s)
+        if not before.reckoned_s:
+            return velocity, picture
+        v = (velocity.v_m_s * since_s - before.reckoned_m) / dt_s
+        return Velocity(v, (velocity.w_rad_s * since_s - before.reckoned_rad) / dt_s), picture
+
+    def reckon(
+        self, dt_s: float, given: Velocity, turn_rate_rad_s: float | None = None
+    ) -> tuple[Velocity, Reckoned]:
+        """Return the motion at an instant without an image, without changing the state."""
+        speed, turn = self._wheels(given, turn_rate_rad_s)
+        assert speed is not None
+        assert turn is not None
+        velocity = Velocity(speed.value, turn.value)
+        return velocity, Reckoned(velocity, dt_s)
 
     def flow(self, grey: np.ndarray, dt_s: float) -> Flow | None:
         """Return the motion from the last image to a reduced grey one; ``None``: not determined."""
@@ -336,9 +382,15 @@ class FlowOdometry(AboutNow):
         forward = forward or Measured(0.0, math.inf)
         return Flow(turn.widened(_SYSTEMATIC), forward.widened(_SYSTEMATIC), len(a))
 
-    def remember(self, picture: Picture) -> None:
-        """Keep an image for the comparison with the next."""
+    def remember(self, picture: Picture | Reckoned) -> None:
+        """Keep an image for the comparison with the next, or add up what was reckoned."""
         before = self.before
+        if isinstance(picture, Reckoned):
+            before.reckoned_s += picture.dt_s
+            before.reckoned_m += picture.velocity.v_m_s * picture.dt_s
+            before.reckoned_rad += picture.velocity.w_rad_s * picture.dt_s
+            return
+        before.reckoned_s = before.reckoned_m = before.reckoned_rad = 0.0
         before.height, before.width = picture.height, picture.width
         before.v_m_s, before.w_rad_s = picture.velocity
         before.v_sigma, before.w_sigma = picture.sigma
@@ -353,22 +405,29 @@ class FlowOdometry(AboutNow):
         size = (grey.shape[1] // factor, grey.shape[0] // factor)
         return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
-    def _velocity(
-        self, flow: Flow | None, dt_s: float, given: Velocity | None, gyroscope: float | None
-    ) -> tuple[Velocity, float, tuple[float, float]]:
-        """Return the motion by all measurements, the time since there was one, and its errors."""
-        c, before = self.config, self.before
-        speeds, turns = [], []
-        if flow is not None:
-            turns.append(flow.turn.times(1.0 / dt_s))
-            if c.camera_height_m is not None or given is None:
-                speeds.append(flow.forward.times(1.0 / dt_s))
+    def _wheels(self, given: Velocity | None, gyroscope: float | None) -> list[Measured | None]:
+        """Return speed and turn rate by wheels and gyroscope."""
+        c, turns = self.config, []
+        speed = None
         if given is not None:
             error = c.given_speed_error * abs(given.v_m_s) + 0.5 * c.min_speed_m_s + 1e-6
-            speeds.append(Measured(given.v_m_s, error))
+            speed = Measured(given.v_m_s, error)
             turns.append(Measured(given.w_rad_s, c.given_turn_error_rad_s))
         if gyroscope is not None:
             turns.append(Measured(gyroscope, c.gyroscope_error_rad_s))
+        return [speed, fused(turns)]
+
+    def _velocity(
+        self, flow: Flow | None, dt_s: float, speed: Measured | None, turn: Measured | None
+    ) -> tuple[Velocity, float, tuple[float, float]]:
+        """Return the motion by all measurements, the time since there was one, and its errors."""
+        c, before = self.config, self.before
+        speeds = [] if speed is None else [speed]
+        turns = [] if turn is None else [turn]
+        if flow is not None:
+            turns.append(flow.turn.times(1.0 / dt_s))
+            if c.camera_height_m is not None or speed is None:
+                speeds.append(flow.forward.times(1.0 / dt_s))
         found = [fused(speeds), fused(turns)]
         held_s = before.held_s + dt_s if None in found else 0.0
         if before.height and held_s <= _HOLD_S:  # the last motion, as it cannot change at once
@@ -382,8 +441,8 @@ class FlowOdometry(AboutNow):
                 for one, now in zip(kept, found, strict=True)
             ]
         v, w = (one or Measured(0.0, 10.0) for one in found)
-        speed = min(max(v.value, -c.max_speed_m_s), c.max_speed_m_s)
-        velocity = Velocity(speed if abs(speed) >= c.min_speed_m_s else 0.0, w.value)
+        limited = min(max(v.value, -c.max_speed_m_s), c.max_speed_m_s)
+        velocity = Velocity(limited if abs(limited) >= c.min_speed_m_s else 0.0, w.value)
         return velocity, held_s, (v.sigma, w.sigma)
 
 

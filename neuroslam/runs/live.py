@@ -137,6 +137,7 @@ class LiveRobot:
         velocity: tuple[float, float] | None = None,
         ranges: np.ndarray | None = None,
         order: Order = "rgb",
+        turn_rate_rad_s: float | None = None,
     ) -> Located:
         """Advance by one instant.
 
@@ -148,6 +149,8 @@ class LiveRobot:
             ranges: Metres at bearings evenly over the full turn, counter-clockwise from straight
                 ahead.
             order: Order of the channels of the picture.
+            turn_rate_rad_s: Of a gyroscope, since the last step; used by
+                ``odometry.use = "fused"``.
 
         Raises:
             BadFrame: If the time does not rise or a value is invalid. The state is unchanged, and
@@ -159,7 +162,10 @@ class LiveRobot:
             began_s = time.perf_counter()
             before, goals = self._known(), self.brain.map.goals
             waiting = {name: goals[name].clone() for name in goals.columns}
-            result = self.brain(Frame(self._frames, time_s, picture, motion, ranges))
+            frame = Frame(
+                self._frames, time_s, picture, motion, ranges, turn_rate_rad_s=turn_rate_rad_s
+            )
+            result = self.brain(frame)
             self._frames += 1
             if before[4] > self.brain.map.n or before[1] < len(self.brain.sessions.merges):
                 self._follower.reset()  # experiences have other ids

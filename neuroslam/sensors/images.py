@@ -114,7 +114,10 @@ class ImageSource(IndexedSource):
         truth = None if truth is None or not np.isfinite(truth).all() else Pose(*truth.tolist())
         image = self._decoded(index)
         require_shape(image, self.image_shape, self.name, index, self.images[index].name)
-        return Frame(index, time_s, image=image, velocity=velocity, truth=truth)
+        turn_rate = None if self.motion is None else self.motion.turn_rate(index)
+        return Frame(
+            index, time_s, image=image, velocity=velocity, truth=truth, turn_rate_rad_s=turn_rate
+        )
 
     def _decoded(self, index: int) -> np.ndarray:
         pixels = self._pixels(index)

@@ -138,6 +138,7 @@ class Streams(Source):
                 time_s,
                 image=camera.next.image if has_image else None,
                 velocity=motion.next.velocity,
+                turn_rate_rad_s=motion.next.turn_rate_rad_s,
                 **samples,
             )
             if has_motion:

@@ -1,10 +1,11 @@
 """Sources without images: a motion CSV or the track of an animal; and the clock of all sources.
 
 A motion CSV has a header and one line per frame. The columns ``v_m_s`` and ``w_rad_s`` (or
-``vtrans`` and ``vrot``) are required. Optional are the time and the true pose, ``x_m``, ``y_m`` and
-``theta_rad``, empty where unknown. Other columns are ignored. The time is ``time_s`` or a column
-with another usual name, in s, ms, us or ns (:mod:`neuroslam.sensors.times`); a table with a column
-that looks like a time and has no usual name is refused.
+``vtrans`` and ``vrot``) are required. Optional are the time, the turn rate of a gyroscope,
+``gyro_rad_s``, and the true pose, ``x_m``, ``y_m`` and ``theta_rad``, both empty where unknown.
+Other columns are ignored. The time is ``time_s`` or a column with another usual name, in s, ms, us
+or ns (:mod:`neuroslam.sensors.times`); a table with a column that looks like a time and has no
+usual name is refused.
 
 A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the times ``t``,
 ``(n,)`` in seconds, or an ``.npy`` with the positions alone.
@@ -47,10 +48,13 @@ from neuroslam.types import Frame, Pose, Velocity
 
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
+_GYROSCOPE = "gyro_rad_s"
 _TRUTH = ("x_m", "y_m", "theta_rad")
 _MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
 _COPIES = 4  # of positions: as they are, as numbers, velocities and poses
-_EXPECTED = "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s and x_m,y_m,theta_rad"
+_EXPECTED = (
+    "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s, gyro_rad_s and x_m,y_m,theta_rad"
+)
 
 
 MAX_SPEED = 1e6
@@ -163,6 +167,8 @@ class Track:
         truth: True poses, ``(n, 3)``, NaN where unknown; ``None`` if there are none.
         rows: Name of each row, for messages.
         notes: How the times were read, one line each.
+        gyroscope: Turn rate by a gyroscope (rad/s), ``(n,)``, NaN where unknown; ``None``: it has
+            none.
     """
 
     name: str
@@ -171,6 +177,13 @@ class Track:
     truth: np.ndarray | None
     rows: Sequence[str]
     notes: tuple[str, ...] = ()
+    gyroscope: np.ndarray | None = None
+
+    def turn_rate(self, index: int) -> float | None:
+        """Return the turn rate by the gyroscope at that frame, or ``None`` if it is unknown."""
+        if self.gyroscope is None or not math.isfinite(self.gyroscope[index]):
+            return None
+        return float(self.gyroscope[index])
 
     def velocity(self, index: int) -> Velocity:
         """Return the motion over the interval that ends at that frame.
@@ -208,7 +221,13 @@ class TrackSource(IndexedSource):
         """Return the frame of that index, see :meth:`IndexedSource.frame`."""
         time_s = self.clock.at(index)
         velocity = self.track.velocity(index)
-        return Frame(index, time_s, velocity=velocity, truth=self.track.pose(index))
+        return Frame(
+            index,
+            time_s,
+            velocity=velocity,
+            truth=self.track.pose(index),
+            turn_rate_rad_s=self.track.turn_rate(index),
+        )
 
 
 def parse_motion(text: str, name: str) -> Track:
@@ -222,7 +241,7 @@ def parse_motion(text: str, name: str) -> Track:
         Velocity(v_m_s=0.5, w_rad_s=0.1)
     """
     table, rows, notes = parse_table(
-        text, name, _MOTION, _EXPECTED, optional=("time_s",), together=_TRUTH
+        text, name, _MOTION, _EXPECTED, optional=("time_s", _GYROSCOPE), together=_TRUTH
     )
     return Track(
         name,
@@ -231,6 +250,7 @@ def parse_motion(text: str, name: str) -> Track:
         np.column_stack([table[field] for field in _TRUTH]) if _TRUTH[0] in table else None,
         rows,
         notes,
+        table.get(_GYROSCOPE),
     )
 
 

@@ -105,6 +105,41 @@ def test_a_brain_with_flow_goes_on_from_its_state(drive):
         one(Frame(9, 0.9, drive[0][0][:40]))
 
 
+@pytest.mark.parametrize("slip", [1.0, 1.3, 3.0])
+def test_wheels_faster_than_the_camera_lead_to_where_those_at_its_rate_do(slip, drive):
+    images, way, turn = drive
+    config = build_config({"odometry": {"method": "flow", "use": "fused", "camera_height_m": 1.1}})
+    wheels, moved = Velocity(slip * float(way.mean()) / DT, 0.0), {}
+    for rate in (1, 4):  # instants of the wheels to one picture
+        one, two, dt = NavigationBrain(config), NavigationBrain(config), DT / rate
+        sums = np.zeros((len(images), 2))
+        for i in range(rate * len(images) - rate + 1):
+            frame = Frame(i, dt * i, None if i % rate else images[i // rate], wheels)
+            if i == 30:  # between two pictures
+                two.load_state_dict(one.state_dict())
+            motion = one(frame).motion
+            assert i < 30 or two(frame).motion == motion
+            sums[-(-i // rate)] += dt * np.array(motion[:2])
+        moved[rate] = sums[1:]
+    np.testing.assert_allclose(moved[4], moved[1], atol=1e-9)
+    assert moved[4][2:, 1].sum() == pytest.approx(turn[2:].sum(), rel=0.02)
+    if slip == 1.0:
+        assert moved[4][:, 0].sum() == pytest.approx(way.sum(), rel=0.03)
+
+
+def test_a_gyroscope_turns_the_robot_between_two_pictures(drive):
+    config = build_config({"odometry": {"method": "flow", "use": "fused"}})
+    brain = NavigationBrain(config)
+    brain(Frame(0, 0.0, drive[0][0], Velocity(1.0, 0.0)))
+    without = brain(Frame(1, 0.1, None, Velocity(1.0, 0.0))).motion
+    by_gyroscope = brain(Frame(2, 0.2, None, Velocity(1.0, 0.0), turn_rate_rad_s=0.1)).motion
+    assert without.w_rad_s == 0.0
+    share = 1.0 / (1.0 + (0.01 / 0.05) ** 2)  # by the variances of both
+    assert by_gyroscope.w_rad_s == pytest.approx(0.1 * share)
+    with pytest.raises(BadFrame, match="turn rate"):
+        brain(Frame(3, 0.3, None, Velocity(1.0, 0.0), turn_rate_rad_s=math.nan))
+
+
 def test_profiles_cannot_be_fused():
     with pytest.raises(ConfigError, match="needs method = 'flow'"):
         build_config({"odometry": {"use": "fused"}})

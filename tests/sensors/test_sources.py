@@ -78,6 +78,14 @@ def refused(spec: object, **options: float) -> str:
 # Images
 
 
+def test_a_gyroscope_is_a_column_of_a_motion_csv(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("time_s,v_m_s,w_rad_s,gyro_rad_s\n0,1,0,0.1\n0.1,1,0,\n0.2,1,0,-0.3\n")
+    assert [f.turn_rate_rad_s for f in open_source(file)] == [0.1, None, -0.3]
+    file.write_text("time_s,v_m_s,w_rad_s\n0,1,0\n0.1,1,0\n")
+    assert [f.turn_rate_rad_s for f in open_source(file)] == [None, None]
+
+
 def test_images_come_in_the_natural_order_of_their_names(tmp_path):
     frames = list(open_source(fill(tmp_path / "f", 11), frame_rate_hz=4.0))
     assert [f.index for f in frames] == list(range(11))
