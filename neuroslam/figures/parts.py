@@ -199,8 +199,8 @@ def draw_pose_cells(
         ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
         ax.grid(visible=False)
         ax.set_box_aspect(n_y / n_x)
-    write_title(axes[0], "Position", "summed over θ")
-    write_title(axes[1], "Heading", "summed over y")
+    write_title(axes[0], "Pose cells", "summed over θ")
+    write_title(axes[1], "Pose cells", "summed over y")
     axes[1].set_yticks(range(0, 360, 90))
     marks = ((injection, "o", "view injects here", 15), (estimate, "x", "estimate", 9))
     for mark, marker, label, size in marks:

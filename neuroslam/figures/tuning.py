@@ -83,7 +83,8 @@ def _draw_differences(axes: Axes, tuning: Tuning) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.set(title="Differences of two templates", xlabel="match error of two templates",
              ylabel="share of pairs (%)", xlim=(0.0, top))  # fmt: skip
-    axes.legend()
+    axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])  # room for the legend over the bars
+    axes.legend(loc="upper left")
 
 
 def _draw_field_of_view(axes: Axes, tuning: Tuning) -> None:
