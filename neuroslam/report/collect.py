@@ -90,6 +90,7 @@ def collect(run: FinishedRun) -> Facts:
         "threshold": run.brain.config.view.threshold,
         "create_threshold": run.brain.config.pose_cells.create_threshold_cells,
         "features": run.brain.config.view.features,
+        "orientations": run.brain.config.view.orientations,
         "actions": ACTIONS,
         "summary": _summary(run),
         "sessions": _sessions(run),
@@ -235,17 +236,23 @@ def _map(run: FinishedRun) -> dict[str, np.ndarray]:
 
 
 def template_pictures(brain: NavigationBrain) -> np.ndarray:
-    """Return the templates as grey pictures, ``uint8``, ``(n, h, w)``; reduced if many."""
+    """Return the templates as grey pictures, ``uint8``, ``(n, h, w)``; reduced if many.
+
+    Templates of gradients are maps of their orientations, one below the other.
+    """
     view = brain.config.view
-    height, width = view.template_height, view.template_width
+    maps = max(view.orientations, 1)
+    height, width = view.template_height // maps, view.template_width
     if not brain.view.n:
-        return np.zeros((0, height, width), np.uint8)
+        return np.zeros((0, maps * height, width), np.uint8)
     pictures = np.stack([brain.view.template_image(i) for i in range(brain.view.n)])
     shrink = math.sqrt(pictures.nbytes / _TEMPLATE_BYTES)
     if shrink <= 1.0:
         return pictures
     size = (max(1, int(width / shrink)), max(1, int(height / shrink)))
-    return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in pictures])
+    layers = pictures.reshape(-1, height, width)
+    reduced = [cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in layers]
+    return np.stack(reduced).reshape(len(pictures), -1, size[0])
 
 
 def _cells(brain: NavigationBrain) -> dict[str, np.ndarray]:

@@ -55,6 +55,25 @@ function picture(source, caption, alt) {
   return make("figure", {}, shown, make("figcaption", { text: caption }));
 }
 
+// A template of gradients: in each cell a stroke along the edge for each orientation, bright where strong.
+function strokes(template, maps) {
+  const [, height, width] = run.templates.shape, rows = height / maps, cell = 9;
+  const canvas = make("canvas", { class: "template", width: cell * width, height: cell * rows, role: "img", "aria-label": `Template ${template}` });
+  const pen = canvas.getContext("2d"), first = template * width * height;
+  pen.fillRect(0, 0, canvas.width, canvas.height);
+  pen.strokeStyle = "#fff";
+  for (let i = 0; i < width * height; i++) {
+    const x = cell * (i % width + 0.5), row = Math.floor(i / width), y = cell * (row % rows + 0.5);
+    const angle = (Math.floor(row / rows) / maps + 0.5) * Math.PI, dx = 0.5 * cell * Math.cos(angle), dy = 0.5 * cell * Math.sin(angle);
+    pen.globalAlpha = run.templates[first + i] / 255;
+    pen.beginPath();
+    pen.moveTo(x - dx, y - dy);
+    pen.lineTo(x + dx, y + dy);
+    pen.stroke();
+  }
+  return canvas;
+}
+
 // The template of an experience, drawn from its bytes.
 function templateFigure(template, note = "") {
   const [n, height, width] = run.templates.shape;
@@ -63,7 +82,12 @@ function templateFigure(template, note = "") {
     figure.append(make("div", { class: "nothing", text: "no template" }), make("figcaption", { text: note }));
     return figure;
   }
-  const madeOf = about.features === "grey" ? "" : ", features of a network";
+  const maps = about.orientations;
+  const madeOf = about.features !== "grey" ? ", features of a network" : maps ? ", edges" : "";
+  if (maps) {
+    figure.append(strokes(template, maps), make("figcaption", { text: `template ${template}${note}${madeOf}` }));
+    return figure;
+  }
   const canvas = make("canvas", { class: "template", width, height, role: "img", "aria-label": `Template ${template}` });
   const pen = canvas.getContext("2d"), image = pen.createImageData(width, height), first = template * width * height;
   for (let i = 0; i < width * height; i++) {

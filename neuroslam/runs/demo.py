@@ -12,6 +12,7 @@ from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_summary
 from neuroslam.figures.sessions import Stage, plot_stages
 from neuroslam.figures.style import readable_source, save
+from neuroslam.figures.views import template_picture
 from neuroslam.runs.files import brain_file, require_free
 from neuroslam.runs.reading import (
     moved_onto,
@@ -136,7 +137,7 @@ def draw_summary(out: str | Path, path: Path) -> None:
         activity=cells.activity.numpy(),
         estimate=cast(PoseEstimate, cells.estimate),
         image=last.image,
-        template=brain.view.template_image(seen) if seen >= 0 else None,
+        template=template_picture(brain.view, seen) if seen >= 0 else None,
         threshold=brain.config.view.threshold,
         odometry_xy=moved_onto(odometry_track(brain.config, trace), track)[:, :2],
         track_xy=track[on],

@@ -15,6 +15,7 @@ import torch
 from neuroslam.errors import RunError
 from neuroslam.figures.maps import plot_map
 from neuroslam.figures.style import render
+from neuroslam.figures.views import template_picture
 from neuroslam.runs.panels import PANELS, Panels
 from neuroslam.state.answers import gathered, pictures_of, scalars_of
 from neuroslam.state.population import Picture
@@ -142,7 +143,7 @@ class TensorBoardRecorder(Recorder):
         if result.frame % self.images_every == 0:
             if frame.image is not None:
                 known = 0 <= result.view.template < brain.view.n
-                template = brain.view.template_image(result.view.template) if known else None
+                template = template_picture(brain.view, result.view.template) if known else None
                 picture = frame_beside_template(frame.image, template)
                 self._write_picture("view/frame_and_template", picture, result.frame)
             for tag, activity in gathered(brain.populations.values(), pictures_of).items():
@@ -219,8 +220,9 @@ class TensorBoardRecorder(Recorder):
         n = brain.view.n
         ids = np.unique(np.linspace(0, n - 1, min(n, self.projected)).round().astype(int))
         images = [brain.view.template_image(int(i)) for i in ids]
+        pictures = [template_picture(brain.view, int(i)) for i in ids]
         size = (_THUMBNAIL, _THUMBNAIL)  # the projector draws square sprites
-        thumbnails = np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images])
+        thumbnails = np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in pictures])
         self._writer.add_embedding(
             np.stack(images).reshape(len(ids), -1),
             metadata=[f"template {i}" for i in ids],

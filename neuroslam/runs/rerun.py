@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from neuroslam.errors import ConfigError, RunError
+from neuroslam.figures.views import template_picture
 from neuroslam.mapping.tables import closes_loop
 from neuroslam.runs.foxglove import jpeg, link_length
 from neuroslam.runs.recording import Recorder, coloured
@@ -162,7 +163,7 @@ class RerunRecorder(Recorder):
             picture = rr.EncodedImage(contents=jpeg(_small(frame.image)), media_type="image/jpeg")
             stream.log("camera/picture", picture)
         if 0 <= result.view.template < brain.view.n:
-            template = brain.view.template_image(result.view.template)
+            template = template_picture(brain.view, result.view.template)
             stream.log("camera/template", rr.Image(template, color_model="L"))
         for tag, activity in gathered(brain.populations.values(), pictures_of).items():
             name = tag.removeprefix("cells/")
