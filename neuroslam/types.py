@@ -30,11 +30,15 @@ class Velocity(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Self-motion since the previous frame: speed, turn rate, and duration in seconds."""
+    """Self-motion since the previous frame: speed, turn rate, and duration in seconds.
+
+    ``v_z_m_s`` is the speed upwards, ``v_m_s`` then the horizontal one; 0 in the plane.
+    """
 
     v_m_s: float
     w_rad_s: float
     dt_s: float
+    v_z_m_s: float = 0.0
 
 
 class Frame(NamedTuple):
@@ -55,6 +59,8 @@ class Frame(NamedTuple):
         truth: Ground-truth pose, if known. Used by evaluation, never by the brain.
         turn_rate_rad_s: Turn rate by a gyroscope over the interval that ends at this frame,
             positive to the left; used by ``odometry.use = "fused"``.
+        v_z_m_s: Measured speed upwards over the same interval as ``velocity``, whose speed is then
+            the horizontal one; ``None``: the robot moves in the plane.
     """
 
     index: int  # type: ignore[assignment] # hides tuple.index, which nothing calls
@@ -67,6 +73,7 @@ class Frame(NamedTuple):
     landmarks: np.ndarray | None = None
     truth: Pose | None = None
     turn_rate_rad_s: float | None = None
+    v_z_m_s: float | None = None
 
 
 class ViewMatch(NamedTuple):

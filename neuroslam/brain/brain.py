@@ -169,6 +169,8 @@ class NavigationBrain(BrainState):
                 checked_number(frame.heading_rad, "heading", "rad")
             if frame.image is not None:
                 check_image(frame.image)
+            if frame.v_z_m_s is not None:
+                checked_number(frame.v_z_m_s, "vertical speed", "m/s")
             for population in self._with["observe"]:
                 observed[population.kind] = population.observe(frame)
             view = None
@@ -193,7 +195,7 @@ class NavigationBrain(BrainState):
         frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)  # type: ignore[arg-type]
-        gap = accepted.gap
+        gap, climb = accepted.gap, 0.0 if frame.v_z_m_s is None else float(frame.v_z_m_s)
         change, broken = (0.0, False) if view is None else self.continuity.compare(view)
         alarm = broken and self._detects
         if gap or alarm:
@@ -201,17 +203,30 @@ class NavigationBrain(BrainState):
                 self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
+            climb = 0.0 if gap else climb
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
         self.continuity.moved(velocity, dt_s)
         match, tracking = BLIND, None
         if view is not None and self.tracker is None:
-            match = self.view.match_or_learn(view)
+            match = self.view.match_or_learn(view, self._hidden())
         elif view is not None:
             match, tracking = self._track(view, Motion(*velocity, dt_s), change, alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
-        motion = Motion(*velocity, dt_s)
+        motion = Motion(*velocity, dt_s, climb)
         return StepInput(frame.index, motion, match, frame.heading_rad, tracking=tracking)
+
+    def _hidden(self) -> np.ndarray | None:
+        """Return which templates cannot match, ``bool (n,)``: those of excluded experiences."""
+        masks = [mask for p in self._with["excludes"] if (mask := p.excludes()) is not None]
+        excluded = np.logical_or.reduce(masks) if masks else np.zeros(1, dtype=bool)
+        if not excluded.any():
+            return None
+        templates = self.map.experiences.array("template")
+        hidden = np.zeros(self.view.n + 1, dtype=bool)  # the last: of experiences without a view
+        hidden[templates[excluded]] = True
+        hidden[templates[~excluded]] = False
+        return hidden[:-1]
 
     def _track(
         self, view: np.ndarray, motion: Motion, change: float, alarm: bool

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from neuroslam.cells.head_direction import HeadDirectionCells
     from neuroslam.cells.navigation import NavigationCells
     from neuroslam.cells.pose import PoseCellNetwork
+    from neuroslam.cells.pose_3d import PoseCells3D
     from neuroslam.cells.speed import SpeedCells
     from neuroslam.spiking.semantic import SemanticCells
 
@@ -83,6 +84,7 @@ class BrainState(QuickModule):
     semantic: "SemanticCells"
     head_direction: "HeadDirectionCells"
     speed: "SpeedCells"
+    pose_3d: "PoseCells3D"
     compass: Compass
     sessions: SessionLog
     recognition: Recognition
@@ -206,6 +208,7 @@ class BrainState(QuickModule):
                 "inform",
                 "step",
                 "vetoes",
+                "excludes",
                 "follow",
                 "learn",
                 "recall",

@@ -11,6 +11,7 @@ from neuroslam.cells.navigation import NavigationCells
 from neuroslam.cells.oscillators import VelocityOscillators
 from neuroslam.cells.place import CompetitiveHebbianPlaceCells
 from neuroslam.cells.pose import PoseCellNetwork
+from neuroslam.cells.pose_3d import PoseCells3D
 from neuroslam.cells.sheet import GridSheet
 from neuroslam.cells.speed import SpeedCells
 from neuroslam.cells.walls import WallMemory
@@ -26,6 +27,7 @@ __all__ = [
     "NavigationCells",
     "OscillatoryInterference",
     "PoseCellNetwork",
+    "PoseCells3D",
     "SpeedCells",
     "VelocityOscillators",
     "WallMemory",

@@ -9,7 +9,9 @@ from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State
 
 
-def move_session(loaded: State, partial: State, match: Match, config: BrainConfig) -> MovedCells:
+def move_session(
+    loaded: State, partial: State, match: Match, config: BrainConfig, name: str = "pose_cells"
+) -> MovedCells:
     """Move bindings and experiences so that the matched experiences coincide on the torus.
 
     Args:
@@ -17,13 +19,12 @@ def move_session(loaded: State, partial: State, match: Match, config: BrainConfi
         partial: State of the whole brain of the session that moves.
         match: Where the two maps meet.
         config: Of both; ``sessions.cells`` sets whether the session also rotates.
+        name: Of the population that holds the bindings.
     """
     cells = config.pose_cells
     torus = (cells.n_xy, cells.n_xy, cells.n_theta)
     states = partial["map.experiences.cell"].numpy()
-    bound = np.column_stack(
-        [partial[f"pose_cells.bindings.{name}"] for name in ("x", "y", "theta")]
-    )
+    bound = np.column_stack([partial[f"{name}.bindings.{axis}"] for axis in ("x", "y", "theta")])
     if config.sessions.cells == "none":
         return MovedCells(np.zeros(3), bound, states)
     poses = partial["map.experiences.pose"].numpy()

@@ -19,6 +19,7 @@ HOMES = {
     "semantic": "neuroslam.spiking.semantic",
     "head_direction": "neuroslam.cells.head_direction",
     "speed": "neuroslam.cells.speed",
+    "pose_3d": "neuroslam.cells.pose_3d",
 }
 """Module of each of the package's own kinds, in the order in which a brain steps them."""
 

@@ -54,6 +54,10 @@ def estimated_bytes(config: BrainConfig) -> dict[str, int]:
         cells = config.pose_cells
         number = 4 if cells.precision == "float32" else 8
         found["pose_cells"] = number * _POSE_CELLS * cells.n_theta * cells.n_xy**2
+    if "pose_3d" in config.cells:
+        cells, n_z = config.pose_cells, config.section("pose_3d").model_dump()["n_z"]
+        number = 4 if cells.precision == "float32" else 8
+        found["pose_3d"] = number * _POSE_CELLS * n_z * (cells.n_xy**2 + cells.n_theta)
     if "place" in config.cells:
         grid, walls = config.grid_cells, config.boundary_cells
         modules = len(grid.spacings_m) * grid.n_cells * (grid.n_cells + 8 * grid.directions)

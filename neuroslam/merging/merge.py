@@ -15,6 +15,7 @@ from neuroslam.merging.states import merge_states, part_of
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State
+from neuroslam.state.population import Population
 
 _CHECK_STEPS = 2_000_000
 """Links times loops of the trial relaxation of a merged map: a fraction of a second."""
@@ -76,6 +77,13 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
         )
         if report.reason:
             return Merged(None, join, report)
+    for name, population in partial.parts().items():
+        if partial.config.sessions.check_residuals and isinstance(population, Population):
+            report.reason = population.contradicts(
+                part_of(one, name), part_of(other, name), match.pairs
+            )
+            if report.reason:
+                return Merged(None, join, report)
     report.merged = True
     new = merged.n - loaded.map.n
     report.reason = (

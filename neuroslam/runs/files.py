@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -167,12 +167,18 @@ class RowWriter:
 
     @classmethod
     @contextlib.contextmanager
-    def create(cls, folder: Path) -> Iterator["RowWriter"]:
-        """Start the files of a new run, in a folder that is made if it is missing."""
+    def create(cls, folder: Path, more: Iterable[str] = ()) -> Iterator["RowWriter"]:
+        """Start the files of a new run, in a folder that is made if it is missing.
+
+        Args:
+            folder: Where they are.
+            more: Columns that populations add, names of :func:`more_columns`.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "frames.csv").open("wb") as frames, (folder / "trace.f64").open("wb") as t:
             writer = cls(folder, frames, t)
-            writer._append("frames.csv", (FRAME_COLUMNS + "\n").encode())
+            header = ",".join([FRAME_COLUMNS, *more])
+            writer._append("frames.csv", f"{header}\n".encode())
             yield writer
 
     @classmethod
@@ -242,11 +248,12 @@ class RowWriter:
         )
         line = (
             f"{r.frame},{motion},{r.view.template},{match},{r.action},{r.experience},{pose},{cells},"
-            f"{r.n_templates},{r.n_experiences},{r.n_links}\n"
+            f"{r.n_templates},{r.n_experiences},{r.n_links}"
         )
+        line = ",".join([line, *(repr(float(v)) for v in more_columns(brain).values())]) + "\n"
         self._append("frames.csv", line.encode())
         truth = frame.truth or (math.nan, math.nan, math.nan)
-        row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion, *truth)
+        row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion[:3], *truth)
         self._append("trace.f64", np.array(row, dtype="<f8").tobytes())
 
     def _append(self, name: str, row: bytes) -> None:
@@ -258,8 +265,16 @@ class RowWriter:
         self._digests[name].update(row)
 
 
+def more_columns(brain: NavigationBrain) -> dict[str, float]:
+    """Return the columns that populations add to ``frames.csv``, with their values now."""
+    found: dict[str, float] = {}
+    for population in brain.populations.values():
+        found |= population.frame_columns()
+    return found
+
+
 def experiences_csv(brain: NavigationBrain) -> str:
-    """Write the experiences as CSV: id,x_m,y_m,theta_rad,template,first_frame."""
+    """Write the experiences as CSV: id,x_m,y_m,theta_rad,template,first_frame, and populations'."""
     table = brain.map.experiences
     rows = zip(
         brain.map.poses.tolist(),
@@ -268,7 +283,13 @@ def experiences_csv(brain: NavigationBrain) -> str:
         strict=True,
     )
     lines = [f"{i},{x!r},{y!r},{t!r},{v},{f}" for i, ((x, y, t), v, f) in enumerate(rows)]
-    return "\n".join(["id,x_m,y_m,theta_rad,template,first_frame", *lines]) + "\n"
+    names = ["id,x_m,y_m,theta_rad,template,first_frame"]
+    for population in brain.populations.values():
+        for name, column in population.experience_columns().items():
+            names.append(name)
+            both = zip(lines, column.tolist(), strict=True)
+            lines = [f"{line},{value!r}" for line, value in both]
+    return "\n".join([",".join(names), *lines]) + "\n"
 
 
 def links_csv(links: Links, weights: np.ndarray | None = None) -> str:
@@ -293,7 +314,7 @@ def write_text(path: Path, text: str) -> None:
 
 def is_whole(line: str) -> bool:
     """Return whether a row of ``frames.csv`` is complete."""
-    return line.endswith("\n") and line.count(",") == FRAME_COLUMNS.count(",")
+    return line.endswith("\n") and line.count(",") >= FRAME_COLUMNS.count(",")
 
 
 def missing_rows(out: str | Path, there: int, seen: int) -> str:

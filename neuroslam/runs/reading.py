@@ -209,7 +209,7 @@ def _all_rows(out: str | Path, rows: int | None) -> list[str]:
 
 
 def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarray]:
-    """Read the columns of ``frames.csv`` that hold numbers, each as an array.
+    """Read the columns of ``frames.csv`` that hold numbers, also those of populations, as arrays.
 
     Args:
         out: Folder of the run.
@@ -218,7 +218,7 @@ def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarra
     Raises:
         RunError: If it is missing or damaged.
     """
-    names = FRAME_COLUMNS.split(",")
+    names = _columns(out)
     numbers = [i for i, name in enumerate(names) if name != "action"]
     lines = _all_rows(out, rows)
     if not lines:
@@ -228,6 +228,16 @@ def read_frames(out: str | Path, rows: int | None = None) -> dict[str, np.ndarra
     except ValueError as error:
         raise RunError(f"{Path(out) / 'frames.csv'}: damaged ({error})") from None
     return {names[i]: table[:, column] for column, i in enumerate(numbers)}
+
+
+def _columns(out: str | Path) -> list[str]:
+    """Return the names of the columns of ``frames.csv``; populations add some after the first."""
+    try:
+        with (Path(out) / "frames.csv").open(encoding="utf-8") as file:
+            header = file.readline().rstrip("\n")
+    except (OSError, ValueError):
+        header = ""
+    return (header if header.startswith(f"{FRAME_COLUMNS},") else FRAME_COLUMNS).split(",")
 
 
 def read_actions(out: str | Path, rows: int | None = None) -> np.ndarray:

@@ -30,6 +30,7 @@ from neuroslam.runs.files import (
     RowWriter,
     RunPlan,
     brain_file,
+    more_columns,
     require_free,
     run_files,
 )
@@ -213,7 +214,7 @@ def run(
             require_free(out, plan.source, overwrite)  # another process may have been faster
             earlier = any((out / name).exists() for name in run_files(out))
             save = RunSaver(folder, folder.staged if earlier else out)
-            with RowWriter.create(save.rows_in) as output:
+            with RowWriter.create(save.rows_in, more_columns(brain)) as output:
                 writer = None
                 if record:
                     only = None if isinstance(record, bool) else record

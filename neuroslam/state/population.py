@@ -16,7 +16,7 @@ import numpy as np
 from neuroslam.config import BrainConfig, Section
 from neuroslam.geometry import rotate
 from neuroslam.state.join import Join, MovedCells
-from neuroslam.state.match import Match
+from neuroslam.state.match import Match, Pairs
 from neuroslam.state.mergeable import (
     Mergeable,
     Rule,
@@ -243,6 +243,12 @@ class Population(Mergeable):
         """
         return now
 
+    def excludes(self) -> np.ndarray | None:
+        """Return at which experiences the robot cannot be, ``bool (n,)``; ``None``: at any.
+
+        Their views do not match: storeys that look alike are distinguished by it.
+        """
+
     def vetoes(self, view: ViewMatch) -> bool:
         """Tell whether the robot cannot be where a view was learnt."""
         return False
@@ -355,6 +361,14 @@ class Population(Mergeable):
         """Return CSV files of a run's folder by name; the first line has the columns."""
         return {}
 
+    def frame_columns(self) -> dict[str, float]:
+        """Return further columns of ``frames.csv`` with their values now, the same names always."""
+        return {}
+
+    def experience_columns(self) -> dict[str, np.ndarray]:
+        """Return further columns of ``experiences.csv``, each ``(n_experiences,)``."""
+        return {}
+
     def points_m(self) -> np.ndarray | None:
         """Return points to draw on the map, ``(n, 2)``."""
         return None
@@ -371,6 +385,16 @@ class Population(Mergeable):
     def merged(self, loaded: State, partial: State, join: Join) -> State:
         """Merge two states by :attr:`merge_rules`; a population with other needs overrides this."""
         return merge_by_rules(self.merge_rules, loaded, partial, join)
+
+    def contradicts(self, loaded: State, partial: State, pairs: Pairs) -> str:
+        """Say why two sessions cannot merge by these pairs; empty if nothing is against it.
+
+        Args:
+            loaded: State of the population in the map that would be merged into.
+            partial: State of it in the session that goes on.
+            pairs: Experiences of both that look the same.
+        """
+        return ""
 
     def renumber(self, change: Renumbering) -> None:
         """Follow a map that forgets, by :attr:`merge_rules`; one with other needs overrides this.

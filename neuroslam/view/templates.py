@@ -281,13 +281,28 @@ class LocalViewCells(Mergeable):
         view, contrast = self._encode(image)
         return None if contrast < self.config.min_contrast else view
 
-    def match_or_learn(self, view: np.ndarray) -> ViewMatch:
-        """Match a view, the result of :meth:`encode`, or store it as a new template."""
+    def match_or_learn(self, view: np.ndarray, hidden: np.ndarray | None = None) -> ViewMatch:
+        """Match a view, the result of :meth:`encode`, or store it as a new template.
+
+        Args:
+            view: The view.
+            hidden: Templates that cannot match, ``bool (n,)``; ``None``: all can.
+        """
         match = self.search(view, self.config.threshold)
+        if hidden is not None and match.template != NO_TEMPLATE and hidden[match.template]:
+            match = self._search_among(view, np.flatnonzero(~hidden))
         if match.template == NO_TEMPLATE or match.error > self.config.threshold:
             match = ViewMatch(self.learn(view), match.error, 0.0, True)
         self.last.template = match.template
         return match
+
+    def _search_among(self, view: np.ndarray, templates: np.ndarray) -> ViewMatch:
+        """Find the nearest of some templates; error and heading as of :meth:`differences`."""
+        errors, turns = self.differences_and_turns(view, templates)
+        if not len(errors):
+            return ViewMatch(NO_TEMPLATE, -1.0, 0.0, False)
+        best = int(errors.argmin())
+        return ViewMatch(int(templates[best]), float(errors[best]), float(turns[best]), False)
 
     def learn(self, view: np.ndarray) -> int:
         """Store a view, the result of :meth:`encode`, as a new template, and return its id.

@@ -12,6 +12,7 @@ from neuroslam.geometry import TWO_PI
 from neuroslam.worlds import paint, paint_outdoors
 from neuroslam.worlds.scene import Route, Sense, Surface, World, ellipse_route, rounded_route
 from neuroslam.worlds.site import Painter, Point, Site
+from neuroslam.worlds.storeys import atrium, garage
 
 
 def _rectangle(x: float, y: float, clockwise: bool) -> list[Point]:
@@ -365,6 +366,8 @@ _BUILDERS: dict[str, Callable[[int], World]] = {
     "town": _town,
     "campus": _campus,
     "district": _district,
+    "garage": garage,
+    "atrium": atrium,
 }
 
 
@@ -372,7 +375,7 @@ def catalogue() -> dict[str, str]:
     """Return the description of each rendered world by its name.
 
     Example:
-        >>> list(catalogue())
+        >>> list(catalogue())[:6]
         ['corridor', 'ellipse', 'figure_eight', 'town', 'campus', 'district']
     """
     return {name: _first_line(builder) for name, builder in _BUILDERS.items()}

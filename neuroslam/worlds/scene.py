@@ -51,6 +51,8 @@ class Route:
     Args:
         points_m: Positions along the path, shape ``(m, 2)``, the first not repeated at the end.
         headings_rad: Heading at each position, shape ``(m,)``.
+        heights_m: Height at each position, ``(m,)``; ``None``: the path is level. Lengths and
+            speeds are horizontal ones.
 
     Example:
         >>> lap = ellipse_route(2.0, 1.0)
@@ -58,12 +60,18 @@ class Route:
         [2.0, 0.0, 1.571]
     """
 
-    def __init__(self, points_m: np.ndarray, headings_rad: np.ndarray) -> None:
+    def __init__(
+        self,
+        points_m: np.ndarray,
+        headings_rad: np.ndarray,
+        heights_m: np.ndarray | None = None,
+    ) -> None:
         closed = np.vstack([points_m, points_m[:1]])
         steps = np.hypot(*np.diff(closed, axis=0).T)
         self._along = np.concatenate([[0.0], np.cumsum(steps)])
         headings = np.unwrap(np.append(headings_rad, headings_rad[0]))
         self._table = np.column_stack([closed, headings])
+        self._heights = None if heights_m is None else np.append(heights_m, heights_m[0])
 
     @property
     def length_m(self) -> float:
@@ -76,6 +84,17 @@ class Route:
         poses = np.column_stack([np.interp(along, self._along, column) for column in self._table.T])
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses
+
+    @property
+    def climbs(self) -> bool:
+        """Whether the path changes its height."""
+        return self._heights is not None
+
+    def heights(self, n: int) -> np.ndarray:
+        """Return the height at ``n`` equidistant poses of one lap, in metres, ``(n,)``."""
+        if self._heights is None:
+            return np.zeros(n)
+        return np.interp(np.arange(n) * (self.length_m / n), self._along, self._heights)
 
     def poses(self, n: int) -> np.ndarray:
         """Return ``n`` equidistant poses of one lap, shape ``(n, 3)``."""
@@ -91,12 +110,16 @@ def ellipse_route(
     return Route(points, np.arctan2(semi_y_m * np.cos(t), -semi_x_m * np.sin(t)))
 
 
-def rounded_route(corners_m: list[tuple[float, float]], radius_m: float) -> Route:
+def rounded_route(
+    corners_m: list[tuple[float, float]], radius_m: float, heights_m: list[float] | None = None
+) -> Route:
     """Return a closed polygon with rounded corners; it starts in the middle of its first side.
 
     Args:
         corners_m: Corners of the polygon, in the order of travel.
         radius_m: Radius of the arcs; smaller where a side is too short for it.
+        heights_m: Height at the middle of each arc, between which the path rises evenly; ``None``:
+            it is level.
     """
     corners = np.asarray(corners_m, dtype=float)
     n = len(corners)
@@ -104,6 +127,7 @@ def rounded_route(corners_m: list[tuple[float, float]], radius_m: float) -> Rout
     lengths = np.hypot(*sides.T)
     headings = np.arctan2(sides[:, 1], sides[:, 0])
     at = (corners[0] + corners[1]) / 2.0
+    arcs: list[int] = []  # number of the point in the middle of each arc, from the second corner
     points: list[np.ndarray] = []
     angles: list[np.ndarray] = []
     for i in range(n):  # along side i to its end, then around the corner there
@@ -122,9 +146,18 @@ def rounded_route(corners_m: list[tuple[float, float]], radius_m: float) -> Rout
             phi = headings[i] + bow - side * math.pi / 2.0
             points.append(centre + radius * np.column_stack([np.cos(phi), np.sin(phi)]))
             angles.append(headings[i] + bow)
+        n_points = sum(map(len, points))
+        arcs.append(n_points - 1 - (len(points[-1]) // 2 if half > 1e-9 else 0))
         at = corners[j] + cut * w
     _add_line(points, angles, at, (corners[0] + corners[1]) / 2.0, headings[0])
-    return Route(np.vstack(points), np.concatenate(angles))
+    path = np.vstack(points)
+    if heights_m is None:
+        return Route(path, np.concatenate(angles))
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    knots = np.array([*heights_m[1:], heights_m[0]])
+    end = (heights_m[0] + heights_m[1]) / 2.0  # the path begins in the middle of the first side
+    z = np.interp(along, [0.0, *along[arcs], along[-1]], [end, *knots, end])
+    return Route(path, np.concatenate(angles), z)
 
 
 def _add_line(
@@ -164,6 +197,9 @@ class World:
         routes: Closed paths; the first is the default.
         lanes_m: Offsets to the left of the route at which pedestrians walk.
         sense: Default camera and motion, see :class:`Sense`.
+        flown: Whether heights of a route are above the one floor of the world, as of a drone;
+            else it has as many storeys that look alike as its routes climb to, and ramps are drawn
+            level.
     """
 
     name: str
@@ -185,6 +221,7 @@ class World:
     sky: np.ndarray | None = None
     haze: tuple[int, int, int] = (90, 88, 84)
     sight_m: float = 18.0
+    flown: bool = False
 
     @cached_property
     def atlas(self) -> Atlas:

@@ -1,6 +1,7 @@
 """Rendered worlds as sources: ``world:corridor?laps=2&people=1`` is a drive through a world."""
 
 import math
+from dataclasses import replace
 from typing import ClassVar, NamedTuple, Self
 
 import cv2
@@ -78,6 +79,18 @@ class OdometryNoise(NamedTuple):
         measured = np.column_stack([v, w])
         measured[0] = velocity[0]
         return measured
+
+    def apply_climb(self, v_z_m_s: np.ndarray, level: float, seed: int) -> np.ndarray:
+        r"""Add the noise of a barometer's rate to true vertical speeds, ``(n,)``, m/s.
+
+        .. math:: \hat v_z = v_z (1 + \ell) + \ell\, n + 0.05\, \ell
+
+        with the level :math:`\ell` and standard normal :math:`n`; the first is unchanged.
+        """
+        n = np.random.default_rng([seed, 6]).standard_normal(len(v_z_m_s))
+        measured = v_z_m_s * (1.0 + level) + level * n + 0.05 * level
+        measured[:1] = v_z_m_s[:1]
+        return np.asarray(measured)
 
 
 class WorldOptions(BaseModel):
@@ -260,14 +273,21 @@ class WorldSource(IndexedSource):
 
         first = round(options.start * self.frames_per_lap)
         lap = self.route.poses(self.frames_per_lap)
+        lap_heights = self.route.heights(self.frames_per_lap)
         along = first + np.arange(self.n_frames)
         self._truths = lap[along % self.frames_per_lap]
+        self._heights = lap_heights[along % self.frames_per_lap]
         moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
+        climbed = np.diff(self._heights, prepend=self._heights[:1])
         if options.kidnapped:
             at_s, share = options.kidnapped.split(":")
             at = max(1, round(float(at_s) * options.rate))
             along[at:] += round(float(share) * self.frames_per_lap)
             self._truths = lap[along % self.frames_per_lap]
+            self._heights = lap_heights[along % self.frames_per_lap]
+            climb = np.diff(self._heights, prepend=self._heights[:1])
+            climb[at : at + 1] = climbed[at : at + 1]
+            climbed = climb
             drive = np.diff(self._truths, axis=0, prepend=self._truths[:1])
             drive[at : at + 1] = moved[at : at + 1]  # odometry does not measure the kidnapping
             moved = drive
@@ -287,6 +307,7 @@ class WorldSource(IndexedSource):
         self._dark, self._blind = _span(options.dark), _span(options.blind)
         true = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), wrap_angles(moved[:, 2])])
         self._velocities = self.noise.apply(true * options.rate, options.seed)
+        self._climbs = self.noise.apply_climb(climbed * options.rate, options.noise, options.seed)
         rng = np.random.default_rng([options.seed, 2])
         self._phases = rng.uniform(0.0, TWO_PI, 2)
         self._people = rng.uniform(0.0, 1.0, (options.people, 2))
@@ -302,6 +323,14 @@ class WorldSource(IndexedSource):
     def odometry(self) -> np.ndarray:
         """Return the measured motion of all frames, ``(n_frames, 2)``: m/s, rad/s."""
         return self._velocities.copy()
+
+    def heights(self) -> np.ndarray:
+        """Return the true height of all frames, ``(n_frames,)`` in metres; 0 in the plane."""
+        return self._heights.copy()
+
+    def climbs(self) -> np.ndarray:
+        """Return the measured speed upwards of all frames, ``(n_frames,)`` in m/s."""
+        return self._climbs.copy()
 
     def gain(self, time_s: float) -> float:
         """Return the brightness at this time: a sum of two slow waves within ``light``."""
@@ -332,7 +361,11 @@ class WorldSource(IndexedSource):
             raise SourceError(f"{self.name}: no frame {index}; expected 0 to {self.n_frames - 1}")
         time_s = index / self.options.rate
         pose = self.truth(index)
-        image = render(self.world, pose, self.camera, self.figures(time_s), self.gain(time_s))
+        camera = self.camera
+        if self.world.flown and self.route.climbs:
+            height = camera.camera_height_m + float(self._heights[index])
+            camera = replace(camera, camera_height_m=height)
+        image = render(self.world, pose, camera, self.figures(time_s), self.gain(time_s))
         if self.options.grey:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if _within(time_s, self._dark):
@@ -350,6 +383,7 @@ class WorldSource(IndexedSource):
             heading_rad=None if self._headings is None else float(self._headings[index]),
             landmarks=self._landmarks(index, pose) if self.options.landmark_reach else None,
             truth=pose,
+            v_z_m_s=float(self._climbs[index]) if self.route.climbs and velocity else None,
         )
 
     def _landmarks(self, index: int, pose: Pose) -> np.ndarray:

@@ -11,6 +11,7 @@ import torch
 import neuroslam
 import neuroslam.compiled as switch
 from neuroslam.cells.head_direction import HeadDirectionConfig
+from neuroslam.cells.pose_3d import Pose3DConfig
 from neuroslam.cells.speed import SpeedCellConfig
 from neuroslam.config import BrainConfig, Section
 from neuroslam.config.semantic import SSPSLAMConfig
@@ -32,7 +33,14 @@ def sections(section):
 
 ALL = {
     each
-    for section in (BrainConfig, SSPSLAMConfig, HeadDirectionConfig, SpeedCellConfig, RosSettings)
+    for section in (
+        BrainConfig,
+        SSPSLAMConfig,
+        HeadDirectionConfig,
+        SpeedCellConfig,
+        Pose3DConfig,
+        RosSettings,
+    )
     for each in sections(section)
 }
 NAMES = {"c", "cells", "config", "settings"} | {

@@ -347,3 +347,34 @@ def test_a_missing_frame_is_an_error():
     source = WorldSource("corridor", WorldOptions(laps=0.1))
     with pytest.raises(SourceError, match="world:corridor: no frame 99; expected 0 to 34"):
         source.frame(99)
+
+
+def test_a_garage_climbs_where_its_path_does_and_comes_back_down():
+    source = open_world("world:garage")
+    z = source.heights()
+    assert z.min() == 0.0
+    assert z.max() == pytest.approx(5.4)
+    assert np.allclose(np.cumsum(source.climbs()) * 0.1, z)
+    frame = source.frame(400)
+    assert frame.v_z_m_s == source.climbs()[400]
+    assert open_world("world:garage?route=2").frame(5).v_z_m_s is None
+    assert open_world("world:corridor").frame(5).v_z_m_s is None
+
+
+def test_storeys_of_a_garage_look_alike_and_a_drone_sees_its_height():
+    garage, atrium = open_world("world:garage"), open_world("world:atrium")
+    for source, alike in ((garage, True), (atrium, False)):
+        truth, z = source.truths(), source.heights()
+        up = np.flatnonzero(z > 2.6)
+        away = np.hypot(*(truth[up, :2] - truth[5, :2]).T)
+        above = int(up[away.argmin()])
+        assert away.min() < 0.15
+        low, high = (source.frame(n).image.astype(float) for n in (5, above))
+        assert (np.abs(low - high).mean() < 8) == alike
+
+
+def test_noise_of_the_climb_is_a_scale_a_bias_and_white():
+    clean, noisy = (open_world(f"world:garage?noise={level}").climbs() for level in (0.0, 0.1))
+    level = clean == 0.0
+    assert noisy[level][1:].std() == pytest.approx(0.1, rel=0.15)
+    assert (noisy - clean * 1.1)[1:].mean() == pytest.approx(0.005, abs=0.01)
