@@ -19,8 +19,8 @@ Kind = TypeVar("Kind", bound=type[Population])
 BRAIN_NAMES = frozenset({
     "about", "clock", "compass", "config", "continuity", "half_taken", "landmarks_m", "largest",
     "leader", "map", "merge", "navigation", "not_joined", "odometry", "parts", "place",
-    "populations", "pose_3d", "pose_cells", "recognition", "restore", "semantic", "sessions",
-    "start_new_map", "store", "stored", "tracker", "view",
+    "populations", "pose_cells", "recognition", "restore", "semantic", "sessions", "start_new_map",
+    "store", "stored", "tracker", "view",
 })  # fmt: skip
 """Attributes that every brain has, or that populations of the package are: no one else's name."""
 
