@@ -27,6 +27,7 @@ def test_there_are_notebooks():
         "03_two_sessions",
         "04_cells_of_a_rat",
         "05_semantic_map",
+        "06_three_dimensions",
     ]
 
 
