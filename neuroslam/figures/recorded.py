@@ -198,7 +198,8 @@ def plot_raster(log: ActivityLog, note: str = "") -> Figure:
     time = (log.time_s - log.time_s[0]) / (60.0 if minutes else 1.0)
     title = f"Activity of all cells, {counted(log.n_samples, 'sample')}"
     with mpl.rc_context(STYLE):
-        figure = new_figure(11.0, 1.75 * len(names) + 0.9, f"{title}\n{note}" if note else title)
+        lines = [title, *textwrap.wrap(note, 90)]
+        figure = new_figure(11.0, 1.75 * len(names) + 0.9, "\n".join(lines))
         panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         for name, ax in zip(names, panels, strict=True):
             order, by = _order(log, name)

@@ -19,6 +19,7 @@ from neuroslam.brain.tracker import Seen
 from neuroslam.config.sequence import SequenceConfig
 from neuroslam.errors import BadFrame, RunError, counted
 from neuroslam.figures.style import STYLE, as_rgb, new_figure, plain_text, save, write_title
+from neuroslam.figures.views import strokes
 from neuroslam.geometry import TWO_PI
 from neuroslam.mapping.actions import nearest_bound_of_arrays
 from neuroslam.runs.files import RunPlan, brain_file
@@ -66,6 +67,7 @@ class Why:
         picture: Image of the frame; ``None``: it has none.
         view: Template that the frame makes, in [0, 1]; ``None``: none.
         template: The candidate, in [0, 1]; ``None``: none.
+        orientations: Of the gradients that views are made of; 0: views are grey.
     """
 
     frame: int
@@ -79,6 +81,7 @@ class Why:
     picture: np.ndarray | None
     view: np.ndarray | None
     template: np.ndarray | None
+    orientations: int = 0
 
 
 def why(
@@ -202,7 +205,7 @@ def _explain(brain: NavigationBrain, frame: Frame, visited: dict[tuple[int, int]
         stored.append({"refused": brain.sessions.refusals[-1].get("reason", "merge refused")})
     return Why(
         frame.index, result.action, closed, verdict, checks, candidate, experience, stored,
-        frame.image, view, stored_template,
+        frame.image, view, stored_template, brain.config.view.orientations,
     )  # fmt: skip
 
 
@@ -330,6 +333,9 @@ def draw_why(found: Why) -> Figure:
             write_title(axes, name if image is not None else f"{name.split(' of')[0]}: none")
             if image is not None and image.dtype == np.uint8:
                 axes.imshow(as_rgb(image))
+            elif image is not None and found.orientations:
+                drawn = strokes(np.round(255.0 * image).astype(np.uint8), found.orientations)
+                axes.imshow(drawn, cmap="gray", vmin=0, vmax=255)
             elif image is not None:
                 axes.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, aspect="auto")
     return figure
