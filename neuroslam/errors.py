@@ -169,6 +169,10 @@ class WriteError(RunError):
     """A run directory that cannot be written: a full disk, a missing permission."""
 
 
+class SharedMapError(NeuroslamError, ValueError):
+    """A message or a journal of a shared map that is damaged, out of bounds, or not reachable."""
+
+
 class SpaceError(NeuroslamError, ValueError):
     """Vectors or positions that do not fit a semantic map: wrong dimension, NaN, unknown name."""
 

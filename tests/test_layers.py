@@ -25,6 +25,7 @@ PLAN = [line.split() for line in """
     odometry view cells spiking mapping
     merging
     brain
+    shared_map
     evaluation
     figures
     adapters

@@ -18,7 +18,12 @@ import typer
 from typer.core import TyperGroup
 
 from neuroslam import compiled
-from neuroslam.cli.batches import experiment_command, fleet_command, sweep_command
+from neuroslam.cli.batches import (
+    experiment_command,
+    fleet_command,
+    live_command,
+    sweep_command,
+)
 from neuroslam.cli.mapping import (
     demo_command,
     localise_command,
@@ -94,6 +99,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "tune": tune_command,
     "sweep": sweep_command,
     "fleet": fleet_command,
+    "live": live_command,
     "inspect": inspect_command,
     "ask": ask_command,
     "verify": verify_command,

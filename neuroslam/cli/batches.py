@@ -176,6 +176,49 @@ def fleet_command(
     return USER_ERROR if report.failed else REFUSED if report.apart else 0
 
 
+def live_command(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of the shared map of a fleet.")
+    ],
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[RUN]...", help="Finished runs to offer first, of robots out of reach."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write the map into, as a run.")
+    ] = None,
+    watch: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS", min=0.1, max=86_400.0,
+            help="Fold again as often as robots offer places, with such pauses, until Ctrl-C.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> int:  # fmt: skip
+    """Fold the places that robots offered to DIR into one map; exit 3: some are in quarantine."""
+    from neuroslam.runs.live_map import LiveReport, fold_folder, offer_runs
+
+    for row in offer_runs(folder, runs or ()):
+        say(
+            f"{row['run']}: {counted(row['places'], 'new place')} of {row['robot']}, "
+            f"{row['bytes'] / 1e6:.2f} MB"
+        )
+
+    def show(report: LiveReport) -> None:
+        say(f"{report.lines()[1]} ({report.seconds:.1f} s)")
+
+    report = fold_folder(folder, out, overwrite=overwrite, on_fold=show, watch_s=watch)
+    summarise(folder=folder, out=out, **report.to_dict())
+    for line in report.lines():
+        say(line)
+    if out is not None:
+        say(f"Written: {out}")
+    return REFUSED if report.fold["quarantine"] else 0
+
+
 def experiment_command(
     name: Annotated[
         str,

@@ -15,6 +15,7 @@ from neuroslam.cli.options import (
     ConfigFile,
     Confirm,
     Landmarks,
+    LiveMap,
     NoTensorboard,
     Offset,
     OnBadFrame,
@@ -23,6 +24,7 @@ from neuroslam.cli.options import (
     Preset,
     Record,
     RecordRate,
+    RobotName,
     RunFolder,
     SaveEvery,
     Smooth,
@@ -88,6 +90,8 @@ def run_command(
         Path | None, typer.Option(metavar="FILE", help="Write a recording for rerun, FILE.rrd.")
     ] = None,
     save_every: SaveEvery = 60.0,
+    live: LiveMap = None,
+    robot: RobotName = "",
     overwrite: Overwrite = False,
     dry_run: Annotated[
         bool,
@@ -112,13 +116,13 @@ def run_command(
         parse_record(record)  # before the source is read
     if confirm is not None:
         assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
-    base = read_checkpoint(brain_file(maps[0]))[0] if maps else None
+    base = read_checkpoint(brain_file(maps[0]))[0] if maps else _config_of(live)
     given = tuple(assignments or ())
     settings = resolve_config(preset, config, given, base)
     if dry_run or out is None:
         named = preset or ("of the stored map" if maps and config is None else "")
         return _dry_run(source, out, settings, named, config, start, stop, offset, overwrite)
-    if preset == "auto" or (preset is None and config is None and not maps):
+    if preset == "auto" or (preset is None and config is None and base is None):
         settings, preset = _estimated(source, config, given, stop, offset, settings, preset)
     with show_frames(source) as (on_start, on_step):
         summary = run(
@@ -144,8 +148,19 @@ def run_command(
             save_every_s=save_every,
             record=False if record is None else parse_record(record) or True,
             record_rate_hz=rate,
+            live=live,
+            robot=robot,
         )
     return _report(summary, out, "run")
+
+
+def _config_of(live: str | None) -> "BrainConfig | None":
+    """Return the config of a shared map; ``None``: this robot is its first."""
+    if live is None:
+        return None
+    from neuroslam.runs.live_map import config_of
+
+    return config_of(live)
 
 
 def _dry_run(

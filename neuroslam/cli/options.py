@@ -253,3 +253,18 @@ def _budget(text: str | None) -> Iterator[None]:
             os.environ.pop(MAX_MEMORY)
         if text is not None and before is not None:
             os.environ[MAX_MEMORY] = before
+
+
+LiveMap = Annotated[
+    str | None,
+    typer.Option(
+        "--live",
+        metavar="DIR",
+        help="Shared map of a fleet, to which the robot offers its places while it maps; without "
+        "--preset or --config, its config is used.",
+    ),
+]
+RobotName = Annotated[
+    str,
+    typer.Option("--robot", metavar="NAME", help="Name of the robot there; default: its session."),
+]

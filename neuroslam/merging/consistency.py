@@ -108,7 +108,7 @@ def check_consistency(
         robust: Leave out pairs that disagree with the others.
     """
     factor = config.sessions.residual_factor
-    sigmas = [_sigmas(one.links, factor) for one in (loaded, partial)]
+    sigmas = [link_sigmas(one.links, factor) for one in (loaded, partial)]
     costs = [_own_cost(one, sigma) for one, sigma in zip((loaded, partial), sigmas, strict=True)]
     freedom = [3 * max(one.n_links - one.n + 1, 0) for one in (loaded, partial)]
     square = max(1.0, (PRIOR_FREEDOM + sum(costs)) / (PRIOR_FREEDOM + sum(freedom)))
@@ -144,8 +144,13 @@ def check_consistency(
     )
 
 
-def _sigmas(links: Links, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard deviations of the position and heading of links, in m and rad."""
+def link_sigmas(links: Links, factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard deviations of the position and heading of links, in m and rad.
+
+    Args:
+        links: Links of one map.
+        factor: ``sessions.residual_factor``.
+    """
     d = links.distance_m
     typical_m = float(np.median(d)) if len(d) else 1.0
     turn = np.abs(wrap_angles(links.facing_rad))

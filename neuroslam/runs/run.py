@@ -7,7 +7,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -21,7 +21,7 @@ from neuroslam.config import (
     read_config_file,
     read_preset,
 )
-from neuroslam.errors import BadFrame, MapError, RunError, SourceError, counted
+from neuroslam.errors import BadFrame, ConfigError, MapError, RunError, SourceError, counted
 from neuroslam.interrupts import noting_interrupts
 from neuroslam.runs.activity import ActivityRecorder, Recorders
 from neuroslam.runs.clocks import resolve_offset
@@ -48,6 +48,9 @@ from neuroslam.state.activity import ACTIVITY, DEFAULT_RATE_HZ
 from neuroslam.state.activity_writer import ActivityWriter
 from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.types import Frame, StepResult
+
+if TYPE_CHECKING:
+    from neuroslam.runs.live_map import LiveRecorder
 
 SAVE_EVERY_S = 60.0
 """Wall-clock seconds between two saves: what a killed run can lose."""
@@ -122,6 +125,8 @@ def run(
     save_every_s: float = SAVE_EVERY_S,
     record: bool | Sequence[str] = False,
     record_rate_hz: float = DEFAULT_RATE_HZ,
+    live: str | Path | None = None,
+    robot: str = "",
 ) -> RunSummary:
     """Map a source and write the files of the run into a folder.
 
@@ -156,6 +161,9 @@ def run(
         record: Write the activity of all cells, or of these populations, into ``activity.zarr``,
             which :meth:`~neuroslam.state.activity.ActivityLog.open` reads.
         record_rate_hz: Samples of it a second.
+        live: Shared map to which the robot offers its places meanwhile, a folder or ``ray:NAME``;
+            see :mod:`neuroslam.runs.live_map`.
+        robot: Name of the robot there; default: its session.
 
     Returns:
         Summary of the run. A bad frame under ``stop`` ends the run; its files are still written,
@@ -200,6 +208,7 @@ def run(
     _name_landmarks(brain, opened, words)
     for one in stored:
         brain.store(one)
+    shared = _shared(live, robot, brain, maps)
     _announce(on_start, stop, opened)
     with (
         limit_threads(usable_threads(brain.config.threads)),
@@ -231,12 +240,32 @@ def run(
 
                     file = None if rerun_save is None else Path(rerun_save)
                     recorder = Recorders([recorder, RerunRecorder(file, rerun)])
+                if shared is not None:
+                    recorder = Recorders([recorder, shared])
                 due = _saver(brain, plan, save, summary, output, recorder, save_every_s)
                 steps = chain([first], steps)
                 _drive(brain, steps, output, recorder, summary, on_step, interrupts, due)
                 _end(brain, plan, summary)
                 _note_source(summary, opened)
+                if shared is not None:
+                    summary.notes.append(shared.note())
                 return write_results(brain, plan, save, summary)
+
+
+def _shared(
+    live: str | Path | None, robot: str, brain: NavigationBrain, maps: Sequence[str | Path]
+) -> "LiveRecorder | None":
+    """Open the shared map of a run; before anything is written, as its config may differ."""
+    if live is None:
+        return None
+    if maps:
+        raise ConfigError(
+            "a robot of a shared map maps by itself: leave --map out; neuroslam localise finds it "
+            "on a map"
+        )
+    from neuroslam.runs.live_map import LiveRecorder
+
+    return LiveRecorder(live, brain, robot)
 
 
 def _opened(source: str | Path, plan: RunPlan, config: BrainConfig) -> Source:
