@@ -28,6 +28,7 @@ def test_there_are_notebooks():
         "04_cells_of_a_rat",
         "05_semantic_map",
         "06_three_dimensions",
+        "07_live_fleet",
     ]
 
 

@@ -127,6 +127,14 @@ def fleet_command(
     on_bad_frame: BadFrame = OnBadFrame.stop,
     jobs: Jobs = None,
     ray: RayAddress = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="New shared map to which all offer their places while they map; its fold is the "
+            "merged map.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Map each SOURCE as one session, merge all; exit 3: some stay apart, 2: one failed."""
@@ -145,6 +153,7 @@ def fleet_command(
             on_bad_frame=on_bad_frame.value,
             jobs=jobs,
             ray=ray,
+            live=live,
             overwrite=overwrite,
             on_done=on_done,
         )

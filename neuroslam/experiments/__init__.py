@@ -27,6 +27,7 @@ EXPERIMENTS = {
     "lab-tour": (_SESSIONS, "lab_tour", None),
     "five-sessions": (_SESSIONS, "five_sessions", None),
     "campus": (_SESSIONS, "campus", None),
+    "live-fleet": ("neuroslam.experiments.live_fleet", "live_fleet", None),
     "real-two-sessions": (_SESSIONS, "real_two_sessions", "."),
     "merging-pairs": ("neuroslam.experiments.merging_pairs", "merging_pairs", "."),
     "compare": ("neuroslam.experiments.compare", "compare", None),

@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from neuroslam.evaluation.trajectory import absolute_trajectory_error
 from neuroslam.figures.sessions import Stage, plot_stages
 from neuroslam.figures.style import SESSIONS, plain_text, save, shortened
 from neuroslam.runs.files import OnBadFrame, RunPlan, brain_file, require_free, write_text
+from neuroslam.runs.live_map import FoldThread, fold_folder, has_offers
 from neuroslam.runs.merge import merge_runs
 from neuroslam.runs.parallel import outcomes
 from neuroslam.runs.reading import read_trace, trajectory, true_poses
@@ -78,6 +79,8 @@ class _Session:
     config: BrainConfig
     preset: str
     on_bad_frame: OnBadFrame
+    live: str | None = None
+    robot: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ def fleet(
     on_bad_frame: OnBadFrame = "stop",
     jobs: int | None = None,
     ray: str | None = None,
+    live: str | Path | None = None,
     overwrite: bool = False,
     on_done: Callable[[str, int, int], None] | None = None,
 ) -> FleetReport:
@@ -114,6 +118,9 @@ def fleet(
         on_bad_frame: As for :func:`neuroslam.runs.run.run`.
         jobs: As for :func:`neuroslam.runs.parallel.parallel_map`.
         ray: As for :func:`neuroslam.runs.parallel.parallel_map`.
+        live: Folder of a new shared map to which all robots offer their places while they map; its
+            fold is then the merged map, and robots in quarantine stay apart; see
+            :mod:`neuroslam.runs.live_map`.
         overwrite: Replace an earlier fleet in ``out``.
         on_done: Called after each run and merge with the stage, the number done and the total.
 
@@ -131,10 +138,13 @@ def fleet(
         raise RunError(f"fleet: got {counted(len(sources), 'source')}; expected at least 2")
     with claimed(out, REPORT, overwrite) as (folder, inside):
         digits = len(str(len(sources)))
+        if live is not None and has_offers(live):
+            raise RunError(f"{live}: holds a shared map already; expected a new folder for --live")
+        where = None if live is None else str(Path(live).resolve())
         orders = [
             _Session(
                 absolute_spec(str(source)), inside / "sessions" / f"{number:0{digits}d}",
-                config or BrainConfig(), preset, on_bad_frame,
+                config or BrainConfig(), preset, on_bad_frame, where, str(number),
             )
             for number, source in enumerate(sources, start=1)
         ]  # fmt: skip
@@ -149,7 +159,8 @@ def fleet(
             for name in ("merges", MERGED):  # of a fleet that was cut off
                 shutil.rmtree(out / name, ignore_errors=True)
         report = FleetReport()
-        found = _collect(_map, orders, jobs, ray, "sessions", on_done)
+        with nullcontext() if where is None else FoldThread(where):
+            found = _collect(_map, orders, jobs, ray, "sessions", on_done)
         for number, (order, outcome) in enumerate(zip(orders, found, strict=True), start=1):
             row = {"session": number, "source": str(sources[number - 1])}
             name = str(order.folder.relative_to(inside))
@@ -157,14 +168,20 @@ def fleet(
         parts = [
             Part(row["folder"], (row["session"],)) for row in report.sessions if not row["error"]
         ]
-        parts = _merge_all(parts, inside, report, jobs, ray, on_done)
+        if where is None:
+            parts = _merge_all(parts, inside, report, jobs, ray, on_done)
+        else:
+            parts = _folded(parts, where, inside, report)
         _conclude(parts, inside, folder.staged, report)
         folder.commit(() if inside == out else ("sessions", "merges", MERGED, "fleet.png"))
     return report
 
 
 def _map(order: _Session) -> dict[str, Any]:
-    arguments = {"preset": order.preset, "on_bad_frame": order.on_bad_frame}
+    arguments = {
+        "preset": order.preset, "on_bad_frame": order.on_bad_frame,
+        "live": order.live, "robot": order.robot,
+    }  # fmt: skip
     return run_one(order.source, order.folder, order.config, **arguments)
 
 
@@ -191,6 +208,23 @@ def _collect(
             if on_done is not None:
                 on_done(what, len(found), len(orders))
     return [found[number] for number in range(len(orders))]
+
+
+def _folded(parts: list[Part], live: str, out: Path, report: FleetReport) -> list[Part]:
+    """Fold the shared map of a fleet; return its part, and those of robots in quarantine."""
+    done = fold_folder(live, out / "merges" / "live", overwrite=True)
+    robots = [int(name) for name in done.fold["robots"]]
+    by_number = {part.sessions[0]: part for part in parts}
+    sessions = tuple(sorted(robots))
+    for row in done.fold["quarantine"]:
+        number = int(row["robot"])
+        if number in by_number and number not in robots:
+            report.tree.append(
+                {"level": 1, "round": 1, "first": [number], "second": list(sessions),
+                 "merged": False, "reason": row["reason"], "reports": []}
+            )  # fmt: skip
+    apart = [part for number, part in by_number.items() if number not in robots]
+    return [Part("merges/live", sessions), *apart]
 
 
 def _merge_all(

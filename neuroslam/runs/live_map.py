@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 
@@ -61,6 +61,11 @@ def config_of(where: str | Path) -> "BrainConfig | None":
         return None
     with Journal(where) as journal:
         return journal.config
+
+
+def has_offers(where: str | Path) -> bool:
+    """Return whether a folder holds a shared map already."""
+    return (Path(where) / FILE).exists()
 
 
 class LiveRecorder(Recorder):
@@ -210,6 +215,13 @@ class FoldThread(threading.Thread):
         """End after the fold in progress."""
         self._ended.set()
         self.join()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.stop()
 
 
 @dataclass

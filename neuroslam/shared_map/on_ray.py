@@ -20,6 +20,9 @@ SPACE = "neuroslam"
 ANSWER_S = 30.0
 """Longest wait for an answer."""
 
+START_S = 300.0
+"""Longest wait for the first: the actor loads torch, on a busy machine for minutes."""
+
 
 class _Keeper:
     """What runs in the actor: a journal, made with the config of the first robot."""
@@ -82,7 +85,7 @@ class RayJournal:
             raise SharedMapError(
                 f"{PREFIX}{name}: there is no such shared map on Ray ({error})"
             ) from None
-        self.config: BrainConfig = self._get(self._actor.open.remote(wanted))
+        self.config: BrainConfig = self._get(self._actor.open.remote(wanted), START_S)
 
     def offer(self, robot: str, message: bytes) -> Receipt:
         """Store an offer; see :meth:`~neuroslam.shared_map.journal.Journal.offer`."""
@@ -99,12 +102,12 @@ class RayJournal:
         found: Layout | None = self._get(self._actor.ask.remote("published"))
         return found
 
-    def _get(self, promise: Any) -> Any:  # noqa: ANN401 - whatever the actor returns
+    def _get(self, promise: Any, wait_s: float = ANSWER_S) -> Any:  # noqa: ANN401 - any answer
         import ray
         from ray.exceptions import RayError, RayTaskError
 
         try:
-            return ray.get(promise, timeout=ANSWER_S)
+            return ray.get(promise, timeout=wait_s)
         except RayTaskError as error:
             cause = error.cause
             if isinstance(cause, SharedMapError | ValueError):  # ConfigError is a ValueError

@@ -166,10 +166,11 @@ class LiveRobot:
             message = encode(offer)
             receipts.append(self.journal.offer(self.name, message))
             self.sent_bytes += len(message)
-            self._acknowledge(offer)
+            self.acknowledge(offer)
         return receipts
 
-    def _acknowledge(self, offer: Offer) -> None:
+    def acknowledge(self, offer: Offer) -> None:
+        """Note that an offer is on the disk of the journal: it is not offered again."""
         ids = offer.sessions
         self._templates.update(template_ids(offer.pixels).tolist())
         self._places.update((ids[row[0]], row[1]) for row in offer.places.tolist())
@@ -196,7 +197,7 @@ class LiveRobot:
                 if own & {offer.sessions[k] for k in offer.places["session"].tolist()}:
                     self.name = self.name or entry.robot
                 if entry.robot == self.name:
-                    self._acknowledge(offer)
+                    self.acknowledge(offer)
                 else:
                     self.taken_bytes += len(entry.message)
             self._cursor, fresh = entries[-1].number, True
@@ -331,6 +332,11 @@ class LiveRobot:
             return None
         at = self._poses.get(_keys_of(map_)[map_.current])
         return None if at is None else compose(at, map_.offset)
+
+    @property
+    def placed(self) -> set[Key]:
+        """Places that lie on this robot's copy of the shared map."""
+        return set(self._poses)
 
     @property
     def n_offered(self) -> int:

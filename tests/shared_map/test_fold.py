@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from neuroslam import BrainConfig, NavigationBrain, load_brain, open_source, save_brain
-from neuroslam.errors import ConfigError, SharedMapError
+from neuroslam.errors import ConfigError, RunError, SharedMapError
+from neuroslam.runs.fleet import fleet
 from neuroslam.runs.live_map import FoldThread, LiveRecorder, fold_folder, offer_runs
 from neuroslam.runs.verify import verify
 from neuroslam.shared_map import Journal, LiveRobot, encode, fold
@@ -222,3 +223,15 @@ def test_a_thread_folds_what_comes(entries, tmp_path):
         thread.stop()
         assert journal.published().upto == 4
         assert not thread.failure
+
+
+def test_a_fleet_maps_live_and_its_fold_is_the_merged_map(tmp_path):
+    sources = [DRIVES["ada"], DRIVES["bob"], DRIVES["stranger"]]
+    report = fleet(sources, tmp_path / "out", live=tmp_path / "shared")
+    assert report.merged["sessions"] == [1, 2]
+    assert report.merged["ate_rmse_m"] < 0.3
+    assert [part["sessions"] for part in report.apart] == [[3]]
+    assert "match" in report.apart[0]["reasons"][0]
+    assert verify(tmp_path / "out" / "merged") == []
+    with pytest.raises(RunError, match="holds a shared map already"):
+        fleet(sources, tmp_path / "again", live=tmp_path / "shared")
