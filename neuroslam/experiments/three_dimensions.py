@@ -138,7 +138,8 @@ def _drive(method: str, source: WorldSource, images: Sequence[np.ndarray]) -> Dr
     made_at = height[first]
     wrong = np.abs(made_at[links.source] - made_at[links.target]) > STOREY_M / 2
     velocity, truth = source.odometry(), source.truths()
-    alone = integrate_velocities(*velocity.T, np.full(len(at), _DT_S), source.truth(0))
+    speed, turn = velocity.T
+    alone = integrate_velocities(speed, turn, np.full(len(at), _DT_S), source.truth(0))
     return Drive(
         truth=np.column_stack([truth[:, :2], height]),
         odometry=np.column_stack([alone[:, :2], np.cumsum(source.climbs()) * _DT_S]),

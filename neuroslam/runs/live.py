@@ -138,6 +138,7 @@ class LiveRobot:
         ranges: np.ndarray | None = None,
         order: Order = "rgb",
         turn_rate_rad_s: float | None = None,
+        v_z_m_s: float | None = None,
     ) -> Located:
         """Advance by one instant.
 
@@ -151,6 +152,7 @@ class LiveRobot:
             order: Order of the channels of the picture.
             turn_rate_rad_s: Of a gyroscope, since the last step; used by
                 ``odometry.use = "fused"``.
+            v_z_m_s: Speed upwards since the last step, for brains with ``pose_3d`` cells.
 
         Raises:
             BadFrame: If the time does not rise or a value is invalid. The state is unchanged, and
@@ -163,8 +165,9 @@ class LiveRobot:
             before, goals = self._known(), self.brain.map.goals
             waiting = {name: goals[name].clone() for name in goals.columns}
             frame = Frame(
-                self._frames, time_s, picture, motion, ranges, turn_rate_rad_s=turn_rate_rad_s
-            )
+                self._frames, time_s, picture, motion, ranges, turn_rate_rad_s=turn_rate_rad_s,
+                v_z_m_s=v_z_m_s,
+            )  # fmt: skip
             result = self.brain(frame)
             self._frames += 1
             if before[4] > self.brain.map.n or before[1] < len(self.brain.sessions.merges):

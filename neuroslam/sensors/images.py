@@ -114,9 +114,17 @@ class ImageSource(IndexedSource):
         truth = None if truth is None or not np.isfinite(truth).all() else Pose(*truth.tolist())
         image = self._decoded(index)
         require_shape(image, self.image_shape, self.name, index, self.images[index].name)
-        turn_rate = None if self.motion is None else self.motion.turn_rate(index)
+        turn_rate = climb = None
+        if self.motion is not None:
+            turn_rate, climb = self.motion.turn_rate(index), self.motion.speed_upwards(index)
         return Frame(
-            index, time_s, image=image, velocity=velocity, truth=truth, turn_rate_rad_s=turn_rate
+            index,
+            time_s,
+            image=image,
+            velocity=velocity,
+            truth=truth,
+            turn_rate_rad_s=turn_rate,
+            v_z_m_s=climb,
         )
 
     def _decoded(self, index: int) -> np.ndarray:

@@ -139,6 +139,7 @@ class Streams(Source):
                 image=camera.next.image if has_image else None,
                 velocity=motion.next.velocity,
                 turn_rate_rad_s=motion.next.turn_rate_rad_s,
+                v_z_m_s=motion.next.v_z_m_s,
                 **samples,
             )
             if has_motion:

@@ -2,7 +2,8 @@
 
 A motion CSV has a header and one line per frame. The columns ``v_m_s`` and ``w_rad_s`` (or
 ``vtrans`` and ``vrot``) are required. Optional are the time, the turn rate of a gyroscope,
-``gyro_rad_s``, and the true pose, ``x_m``, ``y_m`` and ``theta_rad``, both empty where unknown.
+``gyro_rad_s``, the speed upwards, ``v_z_m_s`` (``v_m_s`` is then the horizontal one), and the true
+pose, ``x_m``, ``y_m`` and ``theta_rad``, all empty where unknown.
 Other columns are ignored. The time is ``time_s`` or a column with another usual name, in s, ms, us
 or ns (:mod:`neuroslam.sensors.times`); a table with a column that looks like a time and has no
 usual name is refused.
@@ -48,12 +49,13 @@ from neuroslam.types import Frame, Pose, Velocity
 
 _ALIASES = {"vtrans": "v_m_s", "vrot": "w_rad_s"}
 _MOTION = ("v_m_s", "w_rad_s")
-_GYROSCOPE = "gyro_rad_s"
+_GYROSCOPE, _CLIMB = "gyro_rad_s", "v_z_m_s"
 _TRUTH = ("x_m", "y_m", "theta_rad")
 _MAY_HOLD_PICKLES = (b"\x80", b"PK", b"\x93NUMPY")  # first bytes of a pickle, an .npz and an .npy
 _COPIES = 4  # of positions: as they are, as numbers, velocities and poses
 _EXPECTED = (
-    "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s, gyro_rad_s and x_m,y_m,theta_rad"
+    "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s, gyro_rad_s, v_z_m_s and "
+    "x_m,y_m,theta_rad"
 )
 
 
@@ -169,6 +171,7 @@ class Track:
         notes: How the times were read, one line each.
         gyroscope: Turn rate by a gyroscope (rad/s), ``(n,)``, NaN where unknown; ``None``: it has
             none.
+        climb: Speed upwards (m/s), likewise.
     """
 
     name: str
@@ -178,6 +181,13 @@ class Track:
     rows: Sequence[str]
     notes: tuple[str, ...] = ()
     gyroscope: np.ndarray | None = None
+    climb: np.ndarray | None = None
+
+    def speed_upwards(self, index: int) -> float | None:
+        """Return the speed upwards at that frame, or ``None`` if it is unknown."""
+        if self.climb is None or not math.isfinite(self.climb[index]):
+            return None
+        return float(self.climb[index])
 
     def turn_rate(self, index: int) -> float | None:
         """Return the turn rate by the gyroscope at that frame, or ``None`` if it is unknown."""
@@ -227,6 +237,7 @@ class TrackSource(IndexedSource):
             velocity=velocity,
             truth=self.track.pose(index),
             turn_rate_rad_s=self.track.turn_rate(index),
+            v_z_m_s=self.track.speed_upwards(index),
         )
 
 
@@ -241,7 +252,7 @@ def parse_motion(text: str, name: str) -> Track:
         Velocity(v_m_s=0.5, w_rad_s=0.1)
     """
     table, rows, notes = parse_table(
-        text, name, _MOTION, _EXPECTED, optional=("time_s", _GYROSCOPE), together=_TRUTH
+        text, name, _MOTION, _EXPECTED, optional=("time_s", _GYROSCOPE, _CLIMB), together=_TRUTH
     )
     return Track(
         name,
@@ -251,6 +262,7 @@ def parse_motion(text: str, name: str) -> Track:
         rows,
         notes,
         table.get(_GYROSCOPE),
+        table.get(_CLIMB),
     )
 
 

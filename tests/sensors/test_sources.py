@@ -78,6 +78,12 @@ def refused(spec: object, **options: float) -> str:
 # Images
 
 
+def test_a_speed_upwards_is_a_column_of_a_motion_csv(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("time_s,v_m_s,w_rad_s,v_z_m_s\n0,1,0,0.5\n0.1,1,0,\n0.2,1,0,-0.25\n")
+    assert [f.v_z_m_s for f in open_source(file)] == [0.5, None, -0.25]
+
+
 def test_a_gyroscope_is_a_column_of_a_motion_csv(tmp_path):
     file = tmp_path / "log.csv"
     file.write_text("time_s,v_m_s,w_rad_s,gyro_rad_s\n0,1,0,0.1\n0.1,1,0,\n0.2,1,0,-0.3\n")
