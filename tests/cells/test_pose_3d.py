@@ -57,6 +57,7 @@ def test_the_estimate_follows_odometry_in_all_four_directions(v, w, up):
         found = cells.integrate(Motion(v, w, DT_S, up))
     sizes = np.array([21, 21, 21, 36])
     assert np.abs(apart(np.array(found), at, sizes)).max() < 0.3
+    assert abs(apart(cells.sheet.estimate[0], at[2], 21)) < 0.3  # both networks know the height
 
 
 def test_height_and_heading_have_no_end():
@@ -125,6 +126,7 @@ def test_a_view_brings_height_and_heading_back():
         cells.update_from_view(ViewMatch(-1, -1.0, 0.0, False))  # so that it does not tire
         cells.integrate(Motion(0.0, 0.0, DT_S))
     np.testing.assert_allclose(cells.estimate_3d, bound, atol=0.2)
+    assert cells.sheet.estimate[0] == pytest.approx(bound.z, abs=0.2)
 
 
 def test_a_correction_to_the_east_moves_the_activity_there():
@@ -188,6 +190,21 @@ def test_a_closed_loop_corrects_the_height():
     heights = np.array([(brain(frame), brain.pose_3d.z_m)[1] for frame in biased])
     drifted = 0.03 * DT_S * len(frames)
     assert abs(heights[-1] - z[-1]) < 0.3 * drifted
+    rises, map_z = brain.pose_3d.measured_rises, brain.pose_3d.experience_heights_m
+    residual = map_z[rises.target] - map_z[rises.source] - rises.rise_m
+    assert np.abs(residual).max() < 0.05 * drifted  # many rises share what the loop is open by
+
+
+def test_a_template_of_this_storey_can_match_though_another_storey_has_it_too(monkeypatch):
+    brain = brain_3d()
+    for frame in drive([0])[0]:
+        brain(frame)
+    brain.map.experiences.array("template")[1] = 0
+    excluded = np.arange(brain.map.n) == 1
+    monkeypatch.setattr(brain.pose_3d, "excludes", lambda: excluded)
+    assert not brain._hidden().any()
+    excluded[2] = True
+    assert np.flatnonzero(brain._hidden()).tolist() == [2]
 
 
 def test_a_drive_in_the_plane_has_no_heights():
