@@ -1,7 +1,7 @@
 """One live map for a fleet: four robots map the rendered town in a quarter of the time of one.
 
-Settings were fixed on the town with ``look=0``; the rows of ``look=1``, other houses and other
-noise of the odometry, were measured once with them.
+Settings were fixed on the town with ``look=0``; the rows of ``look=1`` and ``look=2``, other houses
+and other noise of the odometry, were measured once with them.
 """
 
 import random
@@ -309,7 +309,11 @@ def order_rows(of: Town, config: BrainConfig) -> list[dict[str, Any]]:
 
 
 def live_fleet(
-    _data_folder: Path | None, out: Path, *, looks: Sequence[int] = (0, 1), processes: bool = True
+    _data_folder: Path | None,
+    out: Path,
+    *,
+    looks: Sequence[int] = (0, 2, 1),
+    processes: bool = True,
 ) -> dict[str, Any]:
     """Compare one robot with four, spoil the fleet, kill it, and measure how fast it is.
 
@@ -377,8 +381,8 @@ def plot_fleet(of: Town, took: np.ndarray) -> Figure:
     sessions = [each.run.brain.sessions.now.id for each in of.drives[1:]]
     maker = [sessions.index(one) for one in brain.map.experiences.array("session").tolist()]
     with mpl.rc_context(STYLE):
-        figure = new_figure(11.0, 7.6, "The town, mapped by one robot and by a fleet of four")
-        axes = figure.subplots(2, 2, height_ratios=(1.6, 1.0))
+        figure = new_figure(10.0, 8.4, "The town, mapped by one robot and by a fleet of four")
+        axes = figure.subplots(2, 2, height_ratios=(1.7, 1.0))
         colours = [SESSIONS[k] for k in maker]
         for panel, xy, row, shade in zip(
             axes[0], of.maps, of.rows, ([INK] * len(of.maps[0]), colours), strict=True
@@ -393,10 +397,10 @@ def plot_fleet(of: Town, took: np.ndarray) -> Figure:
             panel.set_xlabel("x (m)")
             panel.set_ylabel("y (m)")
         for k in range(4):
-            axes[0, 1].scatter([], [], s=20, c=SESSIONS[k], label=f"made by robot {k + 1}")
-        legend_below(axes[0, 1], 5)
+            axes[0, 1].scatter([], [], s=20, c=SESSIONS[k], label=f"robot {k + 1}")
+        legend_below(axes[0, 1], 3)
         for (times_s, share), row, colour in zip(
-            of.covered, of.rows, (INK, SESSIONS[1]), strict=True
+            of.covered, of.rows, (INK, SESSIONS[5]), strict=True
         ):
             axes[1, 0].plot(times_s, 100.0 * share, color=colour, label=row["robots"])
         axes[1, 0].axhline(95.0, color=WALL, lw=1.0, zorder=0)
@@ -408,7 +412,7 @@ def plot_fleet(of: Town, took: np.ndarray) -> Figure:
                             color=SESSIONS[0])  # fmt: skip
             axes[1, 1].axvline(2.0, color=INK, ls="--", lw=1.0)
             axes[1, 1].text(1.97, 0.0, "target ", ha="right", va="bottom")
-            write_title(axes[1, 1], "Until another robot can use a place", f"{len(took)} places")
+            write_title(axes[1, 1], "Until others can use a place", f"{len(took)} places")
             axes[1, 1].set(xlabel="time (s)", ylabel="places")
         else:
             axes[1, 1].axis("off")

@@ -100,6 +100,9 @@ class _Group(NamedTuple):
 _Refused = dict[Piece, tuple[int, str]]
 """Piece -> number of robots of the largest group that refused it, and its reason."""
 
+_Tried = set[frozenset[tuple[Piece, ...]]]
+"""Pairs of groups that do not merge as they are."""
+
 
 def gather(entries: Iterable[Entry]) -> Records:
     """Return the set of the offers of a journal."""
@@ -120,6 +123,7 @@ def fold(records: Records, config: BrainConfig) -> Folded:
     waiting: list[dict[str, Any]] = []
     groups: list[_Group] = []
     refused: _Refused = {}
+    tried: _Tried = set()
     with limit_threads(usable_threads(config.threads)), torch.inference_mode():
         for piece in records.pieces():
             if piece.fault or len(piece.keys) < LEAST_PLACES:
@@ -131,8 +135,9 @@ def fold(records: Records, config: BrainConfig) -> Folded:
             except MapError as error:  # links that no poses explain
                 waiting.append(_row(piece, f"its links cannot be solved: {error}"))
                 continue
-            groups = _placed(_Group(brain, frozenset([piece.robot]), (piece,)), groups, refused)
-        groups = _joined(groups, refused)
+            one = _Group(brain, frozenset([piece.robot]), (piece,))
+            groups = _placed(one, groups, refused, tried)
+        groups = _joined(groups, refused, tried)
         if not groups:
             return Folded(digest, None, (), waiting, [], np.zeros(0, LAYOUT))
         main = groups[0]
@@ -147,26 +152,24 @@ def fold(records: Records, config: BrainConfig) -> Folded:
     return Folded(digest, main.brain, tuple(sorted(main.robots)), apart + waiting, merges, layout)
 
 
-def _placed(
-    one: _Group, groups: list[_Group], refused: dict[Piece, tuple[int, str]]
-) -> list[_Group]:
+def _placed(one: _Group, groups: list[_Group], refused: _Refused, tried: _Tried) -> list[_Group]:
     """Merge a map with the first group that it is consistent with; else it is a group itself."""
     for i, group in enumerate(groups):
         both = _merged(group, one, refused)
         if both is not None:
             return _ordered([*groups[:i], both, *groups[i + 1 :]])
+        tried.add(frozenset((group.pieces, one.pieces)))
     return _ordered([*groups, one])
 
 
-def _joined(groups: list[_Group], refused: _Refused) -> list[_Group]:
+def _joined(groups: list[_Group], refused: _Refused, tried: _Tried) -> list[_Group]:
     """Match groups with each other until none merge: a later one can connect two earlier ones."""
-    tried: set[tuple[tuple[Piece, ...], tuple[Piece, ...]]] = set()
     again = True
     while again:
         again = False
         for i, first in enumerate(groups):
             for j in range(i + 1, len(groups)):
-                pair = first.pieces, groups[j].pieces
+                pair = frozenset((first.pieces, groups[j].pieces))
                 if pair in tried:
                     continue
                 tried.add(pair)
