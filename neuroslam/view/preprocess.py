@@ -10,6 +10,7 @@ from neuroslam.compiled import compiled, plain_array, runs_compiled
 from neuroslam.config import ViewConfig
 from neuroslam.config.sections import region_in
 from neuroslam.errors import ConfigError
+from neuroslam.geometry import TWO_PI
 from neuroslam.sensors.frames import check_image
 from neuroslam.sensors.grey import to_grey
 
@@ -209,21 +210,56 @@ def oriented_gradients(
     wrapped = min(size[0], 4 * _CELL_PX) if panoramic else 0
     if wrapped:
         grey = cv2.copyMakeBorder(grey, 0, 0, wrapped, wrapped, cv2.BORDER_WRAP)
-    grey = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
-    across = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)  # differences of two pixels
-    down = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
-    strength, angle = np.hypot(across, down), np.arctan2(down, across)
-    at = angle % np.pi * (orientations / np.pi)
-    pooled = np.empty((orientations, rows, width), np.float32)
-    for o in range(orientations):
-        apart = np.abs(at - o)
-        apart = np.minimum(apart, orientations - apart)
-        part = cv2.GaussianBlur(strength * np.maximum(1.0 - apart, 0.0), (0, 0), _POOL_PX)
-        part = part[:, wrapped : wrapped + size[0]]
-        pooled[o] = cv2.resize(part, (width, rows), interpolation=cv2.INTER_AREA)
+    pooled = _pooled_gradients(grey, rows, width, orientations, np.pi, _SMOOTH_PX, wrapped)
     energy = np.sqrt((pooled * pooled).sum(axis=0)) + _FLAT_LEVELS
     view = np.minimum(pooled / (_LARGEST * energy), 1.0)
     return Encoded(view.reshape(height, width).astype(np.float64), contrast)
+
+
+def directed_gradients(image: np.ndarray, rows: int, columns: int, directions: int) -> np.ndarray:
+    """Return the directions of the gradients in each cell of an image, as those of its template.
+
+    Unlike :func:`oriented_gradients`, bright and dark sides are distinguished.
+
+    Args:
+        image: Grey, ``uint8``, ``(h, w)``.
+        rows: Rows of cells.
+        columns: Columns of cells.
+        directions: Number of directions in a full turn.
+
+    Returns:
+        In [0, 1], ``float32``, ``(rows, columns, directions)``.
+
+    Example:
+        >>> step = np.repeat(np.array([[0, 200]], np.uint8), 32, axis=1).repeat(32, axis=0)
+        >>> directed_gradients(step, 1, 2, 4)[0, 0].round(2).tolist()
+        [1.0, 0.0, 0.0, 0.0]
+    """
+    size = (columns * _CELL_PX, rows * _CELL_PX)
+    grey = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    pooled = _pooled_gradients(grey, rows, columns, directions, TWO_PI, 1.0, 0)
+    energy = np.sqrt((pooled * pooled).sum(axis=0)) + _FLAT_LEVELS
+    return np.minimum(pooled / (_LARGEST * energy), 1.0).transpose(1, 2, 0)
+
+
+def _pooled_gradients(
+    grey: np.ndarray, rows: int, columns: int, parts: int, turn: float, blur_px: float, wrapped: int
+) -> np.ndarray:
+    """Sum the gradients of a reduced image by cell and direction, ``(parts, rows, columns)``."""
+    size = (columns * _CELL_PX, rows * _CELL_PX)
+    grey = cv2.GaussianBlur(grey, (0, 0), blur_px)
+    across = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)  # differences of two pixels
+    down = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
+    strength, angle = np.hypot(across, down), np.arctan2(down, across)
+    at = angle % turn * (parts / turn)
+    pooled = np.empty((parts, rows, columns), np.float32)
+    for o in range(parts):
+        apart = np.abs(at - o)
+        apart = np.minimum(apart, parts - apart)
+        part = cv2.GaussianBlur(strength * np.maximum(1.0 - apart, 0.0), (0, 0), _POOL_PX)
+        part = part[:, wrapped : wrapped + size[0]]
+        pooled[o] = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
+    return pooled
 
 
 @compiled

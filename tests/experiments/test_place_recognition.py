@@ -70,7 +70,8 @@ def test_vpr_corridor_is_read_from_its_tar_and_drawn_beside_published_methods(
     monkeypatch.setattr(experiment, "KINDS", kinds)
     result = experiment.vpr_corridor(tmp_path, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "results.json").read_text()) == result
-    assert [row["frames"] for row in result["rows"]] == [1, 10]
+    assert [row["frames"] for row in result["rows"]] == [1, 10, 1, 10]
+    assert [row["recall_at_1"] for row in result["rows"][2:]] == [1.0, 1.0]  # by regions
     assert result["published"]["NetVLAD"]["recall_at_1"] == 0.676
     assert (tmp_path / "out" / "pr_curves.png").stat().st_size > 10_000
     (tmp_path / "truth.json").write_text('{"0": [99]}')
@@ -88,13 +89,19 @@ def test_gradients_and_sequences_recognise_a_real_corridor_better(shared, tmp_pa
     assert recall[gradients, 1] > recall[default, 1] + 0.2
     assert recall[default, 10] > recall[default, 1] + 0.2
     assert recall[gradients, 10] > 0.95
+    assert recall[experiment.REGIONS, 1] > 0.95
+    assert recall[experiment.REGIONS, 10] == 1.0
     assert all(row["ms_per_frame"] > 0 for row in rows)
 
 
-def test_the_real_recordings_have_the_sizes_that_their_authors_give(shared):
+def test_regions_recognise_a_corridor_from_beside_and_in_other_light(shared):
     if not (shared / "data" / "vpr_corridor").is_dir():
         pytest.skip("no vpr_corridor beside the checkout")
     walks = experiment.read_vpr_corridor(shared / "data" / "vpr_corridor")
     assert walks.same.shape == (111, 111)
     assert walks.same.any(axis=1).all()
     assert walks.queries[0].shape[:2] == (120, 160)
+    found = experiment.match_regions(walks)
+    recall = [walks.same[np.arange(111), at].mean() for at in (found.single, found.sequence)]
+    assert recall[0] > 0.6
+    assert recall[1] > 0.9
