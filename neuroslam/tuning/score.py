@@ -37,6 +37,10 @@ MAX_ERROR = 0.1
 MIN_ASPECT = 0.6
 """Aspect of a map, relative to the median of all, below which it is squashed."""
 
+MIN_LINKS = 10
+"""Loop links below which their share of wrong ones is not known: one of a few, wrong or judged so
+by mistake, would decide."""
+
 _NEAR = 0.05  # of the diagonal: nearer than this, two places are not apart
 _LAP_PARTS = 5  # key frames beside a revisit among which the nearest position counts
 _LARGER = 1.5  # times the size of another map, and
@@ -54,7 +58,8 @@ class Trial:
         new_maps: Maps that a kidnapping or a gap began, and sessions after a jump.
         error: 90th percentile of the distance of a frame from the path of its nearest revisit,
             relative to the diagonal of the map.
-        wrong_links: Share of the loop links that join places which the sequences tell apart.
+        wrong_links: Share of the loop links that join places which the sequences tell apart; NaN
+            for fewer than :data:`MIN_LINKS` links.
         growth: New experiences per frame in the last third, relative to the first lap.
         apart: Share of the pairs of different places that are apart on the map.
         aspect: Shorter over longer principal axis of the map.
@@ -231,13 +236,13 @@ def _aspect(track: np.ndarray) -> float:
 
 
 def _wrong_links(brain: NavigationBrain, keys: np.ndarray, found: Revisits) -> float:
-    """Return the share of the loop links whose places the sequences tell apart."""
+    """Return the share of the loop links whose places the sequences distinguish; NaN for few."""
     source, target = (end[closes_loop(*brain.map.links[:2])] for end in brain.map.links[:2])
     first = brain.map.experiences["first_frame"].numpy()
     i, j = (np.searchsorted(keys, first[end]).clip(max=len(keys) - 1) for end in (source, target))
     far = np.abs(i - j) >= found.gap
-    if not far.any():
-        return 0.0
+    if far.sum() < MIN_LINKS:
+        return math.nan
     wrong = ~(found.near | found.unsure)
     return float(wrong[i[far], j[far]].mean())
 
@@ -260,12 +265,12 @@ def _growth(brain: NavigationBrain, keys: np.ndarray, found: Revisits) -> float:
 FIGURES = {
     "off the map": (lambda one: 1.0 - one.on_map, 0.005, 0.02),
     "error": (lambda one: one.error, 0.001, 0.003),
-    "wrong links": (lambda one: one.wrong_links, 0.002, 0.01),
+    "wrong links": (lambda one: float(np.nan_to_num(one.wrong_links)), 0.002, 0.01),
     "growth": (lambda one: one.growth, 0.02, 0.05),
     "new maps": (lambda one: float(one.new_maps), 0.0, 1.0),
 }
 """Figures that decide, smaller for a better map: how much larger still counts as equal, and how
-much smaller is clearly better."""
+much smaller is clearly better. Of few loop links none counts as wrong."""
 
 
 def cost(one: Trial) -> float:

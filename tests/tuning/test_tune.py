@@ -23,7 +23,7 @@ from neuroslam.tuning import tune
 from neuroslam.tuning.drive import key_frames, read_drive
 from neuroslam.tuning.motion import Shifts, field_of_view, measure_shifts
 from neuroslam.tuning.revisits import Revisits, find_revisits
-from neuroslam.tuning.score import Mapped, Trial, refuse, score
+from neuroslam.tuning.score import Mapped, Trial, better_by, refuse, score
 from neuroslam.tuning.tune import choose
 from neuroslam.view.preprocess import Encoded
 
@@ -171,8 +171,17 @@ def test_a_map_that_cannot_be_right_is_refused(track, made, reason):
 
 
 def test_a_link_between_places_that_sequences_tell_apart_is_wrong():
-    assert trial_of(ring(N, 2), links=[(60, 10)]).wrong_links == 1.0
-    assert trial_of(ring(N, 2)).wrong_links == 0.0
+    wrong = [(60 + k, 10) for k in range(10)]
+    assert trial_of(ring(N, 2), links=wrong).wrong_links == 1.0
+
+
+def test_a_single_loop_link_decides_nothing():
+    few, none = trial_of(ring(N, 2), links=[(60, 10)]), trial_of(ring(N, 2))
+    assert np.isnan(few.wrong_links)
+    assert np.isnan(none.wrong_links)
+    assert choose([replace(few, name="auto"), none])[0].name == "auto"
+    many = trial_of(ring(N, 2), links=[(60 + k, 10) for k in range(10)])
+    assert not better_by(many, few)
 
 
 AUTO = Trial("auto", BrainConfig(), 1.0, 0, 0.02, 0.0, 0.05, 1.0, 0.5, 99, 99, ring(N, 2), None)
