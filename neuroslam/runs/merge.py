@@ -30,8 +30,10 @@ _ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
 def join_brains(*brains: NavigationBrain) -> tuple[NavigationBrain | None, list[MergeReport]]:
     """Match and merge finished maps, then the stored maps of any.
 
-    All pairs are matched; of those that meet, the one with most matched experiences is merged
-    first, then the pairs with the merged map are matched again.
+    Of a drive with several maps the largest is matched, :attr:`NavigationBrain.largest`. All pairs
+    are matched; of those that meet, the one with most matched experiences is merged first, then
+    the pairs with the merged map are matched again. If the last drive ended on another map than
+    its largest one, that map joins the merged one, or stays the present one beside it.
 
     Args:
         *brains: At least two; the ids of the first stay, the session of the last can be resumed
@@ -41,7 +43,10 @@ def join_brains(*brains: NavigationBrain) -> tuple[NavigationBrain | None, list[
         The merged brain, or ``None`` if a map meets no other; and a report of each merge of
         ``brains``, then of the stored maps, or of each refusal.
     """
-    pool, reports = dict(enumerate(brains)), list[MergeReport]()
+    pool, reports = dict(enumerate(map(_largest_first, brains))), list[MergeReport]()
+    last = brains[-1]
+    if pool[len(brains) - 1] is not last:  # its present map, with which the session goes on
+        pool[len(brains) - 1] = _largest_first(last, keep_present=False)
     found: dict[tuple[int, int], Found] = {}
     while len(pool) > 1:
         for i, j in combinations(sorted(pool), 2):
@@ -60,7 +65,39 @@ def join_brains(*brains: NavigationBrain) -> tuple[NavigationBrain | None, list[
         del pool[i]
         found = {pair: of for pair, of in found.items() if not {i, j} & {*pair}}
     (merged,) = pool.values()
-    return _join_stored(merged, reports)
+    merged, reports = _join_stored(merged, reports)
+    return (merged if last.largest is last else _go_on(last, merged, reports)), reports
+
+
+def _largest_first(brain: NavigationBrain, keep_present: bool = True) -> NavigationBrain:
+    """Return a brain whose present map is the largest of its drive; the others are stored."""
+    largest = brain.largest
+    if largest is brain:
+        return brain
+    others = [one for one in brain.stored if one is not largest]
+    return _alone(largest, [*others, _alone(brain)] if keep_present else others)
+
+
+def _alone(brain: NavigationBrain, stored: Sequence[NavigationBrain] = ()) -> NavigationBrain:
+    """Return a copy of a brain with other stored maps."""
+    own = {name: v for name, v in brain.state_dict().items() if not name.startswith("stored.")}
+    copied = NavigationBrain(brain.config)
+    copied.restore(own, stored)
+    return copied
+
+
+def _go_on(
+    last: NavigationBrain, merged: NavigationBrain, reports: list[MergeReport]
+) -> NavigationBrain:
+    """Return the last drive on its present map: part of the merged map, or beside it."""
+    others, present = list(merged.stored), _alone(last)
+    found = find_match(merged, present)
+    if found.match is not None:
+        joined, report = _alone(merged).merge(present, found.match)
+        if joined is not None:
+            reports.append(report)
+            return _alone(joined, others)
+    return _alone(last, [_alone(merged), *others])
 
 
 def _merge_found(

@@ -11,6 +11,7 @@ from neuroslam import load_brain, open_source
 from neuroslam.runs.export import export
 from neuroslam.runs.inspect import inspect
 from neuroslam.runs.localise import localise
+from neuroslam.runs.merge import merge_runs
 from neuroslam.runs.run import resolve_config, resume, run
 from neuroslam.runs.verify import verify
 
@@ -81,3 +82,20 @@ def test_a_run_is_resumed_where_the_robot_is_not_on_the_largest_map(tmp_path):
     resume(half, stop=LONG + SHORT)
     for name in ("experiences.csv", "links.csv", "trajectory.tum", "frames.csv"):
         assert (half / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_merge_takes_the_largest_map_and_goes_on_where_the_robot_is(tmp_path):
+    whole = driven(tmp_path, LONG, SHORT)
+    first = driven(tmp_path, stop=LONG, out="first")
+    present, known = (load_brain(out / "brain.safetensors") for out in (whole, first))
+    assert present.largest is not present
+    for pair in ((first, whole), (whole, first)):
+        out = tmp_path / pair[0].name / "both"
+        summary, reports = merge_runs(*pair, out)
+        assert summary is not None, reports[0].reason
+        both = load_brain(out / "brain.safetensors")
+        assert both.largest.map.n == known.map.n
+        goes_on = present if pair[1] == whole else known
+        assert (both.map.n, both.clock.frame) == (goes_on.map.n, goes_on.clock.frame)
+        assert sorted(one.map.n for one in (both, *both.stored)) == [present.map.n, known.map.n]
+        assert verify(out) == []
