@@ -237,7 +237,8 @@ class NavigationBrain(BrainState):
         errors, headings = self.view.compare(view)
         of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
         found = self.tracker.judge(of_experience, self.map, motion, change, alarm)
-        if found.kind == "kidnapped":
+        recalled = self._recall_stored(view, motion, alarm, found)
+        if found.kind == "kidnapped" or (recalled and self._jumped(found)):
             self.start_new_map("kidnapped")
             return self.view.match_or_learn(view), Tracking("explore", self.map.current)
         if found.kind == "set":
@@ -253,6 +254,29 @@ class NavigationBrain(BrainState):
         template = int(templates[here])
         heading = float(headings[template]) if template != NO_TEMPLATE else 0.0
         return ViewMatch(template, error, heading, False), found
+
+    def _recall_stored(
+        self, view: np.ndarray, motion: Motion, alarm: bool, found: Tracking
+    ) -> bool:
+        """Return whether the sequence of views shows a place of a stored map."""
+        assert self.recognition.sequence is not None
+        if not len(self.stored):
+            return False
+        known = found.kind in ("at", "link", "set")
+        if alarm or known:
+            self.recognition.sequence.forget()
+        moves = motion.v_m_s != 0.0 or motion.w_rad_s != 0.0
+        return not known and moves and self._judge_stored(view)
+
+    def _jumped(self, found: Tracking) -> bool:
+        """Return whether a sudden change of view began the sequence that a stored map explains.
+
+        Then odometry does not connect the place with the present map.
+        """
+        assert self.tracker is not None
+        assert self.recognition.sequence is not None
+        sequence = self.recognition.sequence.state.streak + self.config.sequence.memory_frames
+        return found.kind == "wait" or self.tracker.state.since_sudden <= sequence
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""

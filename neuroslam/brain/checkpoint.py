@@ -8,12 +8,13 @@ from torch import Tensor, nn
 
 from neuroslam.brain.brain import NavigationBrain
 from neuroslam.brain.soundness import faults_of
+from neuroslam.brain.stored_sequence import StoredSequence
 from neuroslam.config import BrainConfig, build_config
 from neuroslam.errors import CheckpointError, ConfigError, RenamedKeyWarning, first_line
 from neuroslam.state.files import load_checked, save_checked
 from neuroslam.state.sessions import Session, session_id
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 
 
 def save_brain(brain: NavigationBrain, path: str | Path) -> str:
@@ -55,6 +56,8 @@ def read_checkpoint(path: str | Path) -> tuple[BrainConfig, dict[str, Tensor]]:
         tensors = _beside_paths(tensors)
     if about["format"] < 7:
         tensors = _after_calm(tensors)
+    if about["format"] < 8:
+        tensors = _without_stored_sequence(tensors, config)
     return config, tensors
 
 
@@ -114,6 +117,18 @@ def _after_calm(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     calm = torch.tensor(0.0, dtype=torch.float64)
     known = [name.removesuffix("usual") for name in tensors if name.endswith(ends)]
     return tensors | {f"{one}recent": calm.clone() for one in known}
+
+
+def _without_stored_sequence(tensors: dict[str, Tensor], config: BrainConfig) -> dict[str, Tensor]:
+    """Convert a state of formats up to 7, without evidence for the stored maps."""
+    ends = "tracker.state.mode"
+    tracked = [name.removesuffix(ends) for name in tensors if name.endswith(ends)]
+    fresh = StoredSequence(config.sequence).state_dict()
+    return tensors | {
+        f"{one}recognition.sequence.{name}": value.clone()
+        for one in tracked
+        for name, value in fresh.items()
+    }
 
 
 def _of_one_session(

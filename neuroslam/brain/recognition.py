@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from neuroslam.brain.stored_sequence import StoredGraph, StoredSequence
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.overlap import Tolerance, agreeing, n_places
 from neuroslam.state.join import Join
@@ -21,9 +22,14 @@ class StoredViews:
 
     Args:
         views: Templates of at least one map, all with equal configs.
+        maps: The maps.
+
+    Attributes:
+        graph: Their experiences and links.
     """
 
-    def __init__(self, views: Sequence[LocalViewCells]) -> None:
+    def __init__(self, views: Sequence[LocalViewCells], maps: Sequence[ExperienceMap]) -> None:
+        self.graph = StoredGraph(maps, [one.n for one in views])
         self.joined = LocalViewCells(views[0].config)
         self.joined.templates.replace(
             **{
@@ -46,6 +52,13 @@ class StoredViews:
         where = int(np.searchsorted(self.starts, match.template, side="right")) - 1
         return where, match._replace(template=match.template - int(self.starts[where]))
 
+    def compare(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return match error and relative heading of a view with every experience of all maps."""
+        errors, headings = self.joined.compare(view)
+        return np.append(errors, 1.0)[self.graph.template], np.append(headings, 0.0)[
+            self.graph.template
+        ]
+
     def runner_up(self, view: np.ndarray, where: int, near: np.ndarray) -> float | None:
         """Return the smallest match error with templates except ``near`` of map ``where``."""
         rest = np.setdiff1d(np.arange(self.joined.n), self.starts[where] + near)
@@ -59,10 +72,15 @@ class Arrivals(Scalars):
 
 
 class Recognition(Mergeable):
-    """Recent view matches with stored maps: the evidence for joining one."""
+    """Recent view matches with stored maps: the evidence for joining one.
+
+    Attributes:
+        sequence: Evidence of sequences of views; ``None`` where single views decide.
+    """
 
     def __init__(self) -> None:
         super().__init__()
+        self.sequence: StoredSequence | None = None
         self.state = Arrivals(arrivals=0)
         integers = ("arrival", "map", "loaded", "partial")
         self.sightings = GrowingTable(
@@ -78,11 +96,13 @@ class Recognition(Mergeable):
         partial[:] = change.experiences[partial]
 
     def merged(self, loaded: State, partial: State, join: Join) -> State:
-        """Drop all matches: the ids have changed."""
-        return {
-            name: value if name.startswith("state.") else value[:0]
-            for name, value in partial.items()
-        }
+        """Drop all matches and the evidence of sequences: the ids have changed."""
+        own = {name: v for name, v in partial.items() if not name.startswith("sequence.")}
+        merged = {name: v if name.startswith("state.") else v[:0] for name, v in own.items()}
+        if self.sequence is not None:
+            fresh = StoredSequence(self.sequence.config).state_dict()
+            merged |= {f"sequence.{name}": value for name, value in fresh.items()}
+        return merged
 
     def arrive(self, window: int) -> None:
         """Count an arrival at an experience; drop matches more than ``window`` arrivals ago."""

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from neuroslam.brain.brain import NavigationBrain
+from neuroslam.brain.stored_sequence import StoredSequence
 from neuroslam.brain.tracker import SequenceTracker
 from neuroslam.config import BrainConfig
 from neuroslam.errors import counted, first_line, listed
@@ -72,6 +73,14 @@ def faults_of(state: State, model: NavigationBrain) -> list[str]:
             f"recognition.tally: {counted(tallies, 'row')}; "
             f"expected {counted(len(numbers), 'row')}, one per stored map"
         )
+    if "recognition.sequence.evidence.cost" in own:
+        n = sum(len(part["map.experiences.pose"]) for part in stored.values())
+        own_part = {
+            key.removeprefix("recognition.sequence."): np.asarray(value)
+            for key, value in own.items()
+            if key.startswith("recognition.sequence.")
+        }
+        faults += StoredSequence.faults(own_part, n)
     return faults
 
 

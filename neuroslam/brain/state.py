@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from neuroslam.brain.compass import Compass
 from neuroslam.brain.continuity import Continuity
 from neuroslam.brain.recognition import Recognition, StoredViews
+from neuroslam.brain.stored_sequence import StoredSequence
 from neuroslam.brain.tracker import SequenceTracker
 from neuroslam.config import BrainConfig
 from neuroslam.config.populations import HOMES
@@ -172,6 +173,7 @@ class BrainState(QuickModule):
         self.tracker: SequenceTracker | None = None
         if config.map.closure == "sequence" and leader.relaxes_map and leader.needs_views:
             self.tracker = SequenceTracker(config.sequence)
+            self.recognition.sequence = StoredSequence(config.sequence)
         self._changed()
         if set(self._populations) - HOMES.keys():  # those of the package have names of their own
             check_names(self._populations.values())
@@ -283,6 +285,8 @@ class BrainState(QuickModule):
         for one in (other, *other.stored):
             if one.map.n:
                 self._store_one(one)
+        if self.recognition.sequence is not None:
+            self.recognition.sequence.forget()
         self._changed()
 
     def _store_one(self, one: Self) -> None:
@@ -308,7 +312,8 @@ class BrainState(QuickModule):
         if not self.map.n:
             return
         before, tally = self.sessions.now, self.recognition.tally
-        senses = self.odometry, self.continuity  # kept: they compare successive frames
+        # Kept: they compare successive frames.
+        senses, sequence = (self.odometry, self.continuity), self.recognition.sequence
         kept = type(self)(self.config)
         kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
@@ -317,6 +322,7 @@ class BrainState(QuickModule):
         for kind, population in self._populations.items():
             population.continue_from(populations[kind])
         self.odometry, self.continuity = senses
+        self.recognition.sequence = sequence
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)
         self.recognition.store()
@@ -345,6 +351,8 @@ class BrainState(QuickModule):
         for i, one in enumerate(stored):
             own |= {f"stored.{i}.{name}": value for name, value in one.state_dict().items()}
         self.load_state_dict(own)
+        if self.recognition.sequence is not None:
+            self.recognition.sequence.forget()
         tally = self.recognition.tally
         rows = {name: tally[name][: len(stored)] for name in tally.columns}
         tally.replace(**rows)
@@ -361,9 +369,11 @@ class BrainState(QuickModule):
         if not len(self.stored):
             return False
         recognition.arrive(WINDOW * config.confirm)
-        if self._stored_views is None:
-            self._stored_views = StoredViews([one.view for one in self.stored])
-        where, seen = self._stored_views.search(encoded)
+        if self._recognise_sequence(frame, encoded, view):
+            return True
+        if not len(self.stored):
+            return False
+        where, seen = self._searched.search(encoded)
         if seen.template == NO_TEMPLATE:
             return False
         loaded = self.stored[where].map
@@ -387,10 +397,56 @@ class BrainState(QuickModule):
             partial=self.map.current,
             turn_rad=float(agreed.turn_rad[-1]),
             error=seen.error,
-            runner_up=self._stored_views.runner_up(encoded, where, near),
+            runner_up=self._searched.runner_up(encoded, where, near),
             others=agreed.pick(slice(-1)),
         )
         return self._join(where, match, frame)
+
+    @property
+    def _searched(self) -> StoredViews:
+        """The stored maps as one memory."""
+        if self._stored_views is None:
+            self._stored_views = StoredViews(
+                [one.view for one in self.stored], [one.map for one in self.stored]
+            )
+        return self._stored_views
+
+    def _judge_stored(self, encoded: np.ndarray) -> bool:
+        """Return whether the sequence of views shows a place of a stored map."""
+        if self.recognition.sequence is None or not len(self.stored):
+            return False
+        stored = self._searched
+        return self.recognition.sequence.judge(stored.compare(encoded)[0], stored.graph)
+
+    def _recognise_sequence(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
+        """Join a stored map if the sequence of views shows a place of it, and track it there."""
+        sequence, recognition = self.recognition.sequence, self.recognition
+        if sequence is None or not sequence.believed:
+            return False
+        candidate, graph = sequence.state.candidate, self._searched.graph
+        where, experience = graph.locate(candidate)
+        turn_rad = float(self._searched.compare(encoded)[1][candidate]) - view.relative_heading_rad
+        recognition.note(
+            where, np.array([experience]), self.map.current, turn_rad, sequence.state.error
+        )
+        loaded = self.stored[where].map
+        limits = tolerance((loaded, self.map), self.config)
+        agreed = recognition.confirmed(where, loaded, self.map, limits)
+        costs = sequence.evidence.array("cost")[graph.starts[where] : graph.starts[where + 1]]
+        costs = costs.copy()
+        match = Match(
+            loaded=int(agreed.loaded[-1]),
+            partial=self.map.current,
+            turn_rad=float(agreed.turn_rad[-1]),
+            error=float(agreed.error[-1]),
+            others=agreed.pick(slice(-1)),
+        )
+        joined = self._join(where, match, frame)
+        if joined and self.tracker is not None:
+            self.tracker.track(costs)
+        elif not joined:
+            sequence.forget()
+        return joined
 
     def _join(self, where: int, match: Match, frame: Frame) -> bool:
         """Join stored map ``where``, and then those that share a session with it."""

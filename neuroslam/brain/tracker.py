@@ -203,6 +203,16 @@ class SequenceTracker(Mergeable):
             if not NO_EXPERIENCE <= int(state[f"state.{name}"]) < n_experiences:
                 yield f"tracker.state.{name}: no experience {state[f'state.{name}']}"
 
+    def track(self, costs: np.ndarray) -> None:
+        """Go on at known places, with the evidence for a stored map that was joined.
+
+        Args:
+            costs: Accumulated costs of its experiences, the first ones of the map, ``(m,)``.
+        """
+        for name in ("cost", "fresh"):
+            self.evidence.array(name)[: len(costs)] = costs
+        self.state.mode, self.state.localised = Mode.TRACKS, 1
+
     def judge(
         self,
         errors: np.ndarray,
