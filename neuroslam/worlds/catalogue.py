@@ -9,7 +9,7 @@ import numpy as np
 
 from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.geometry import TWO_PI
-from neuroslam.worlds import paint, paint_outdoors
+from neuroslam.worlds import alike, paint, paint_outdoors
 from neuroslam.worlds.scene import Route, Sense, Surface, World, ellipse_route, rounded_route
 from neuroslam.worlds.site import Painter, Point, Site
 from neuroslam.worlds.storeys import atrium, garage
@@ -368,6 +368,9 @@ _BUILDERS: dict[str, Callable[[int], World]] = {
     "district": _district,
     "garage": garage,
     "atrium": atrium,
+    "rooms": alike.rooms,
+    "wallpaper": alike.wallpaper,
+    "corners": alike.corners,
 }
 
 

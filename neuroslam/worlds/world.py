@@ -194,8 +194,8 @@ class WorldOptions(BaseModel):
     )
     kidnapped: str = Field(
         default="",
-        pattern=r"^(\d+:0?\.\d+)?$",
-        description="kidnap the robot, as 60:0.5: at 60 s by half a lap",
+        pattern=r"^(\d+:0?\.\d+(,\d+:0?\.\d+)*)?$",
+        description="kidnap the robot, as 60:0.5: at 60 s by half a lap; several as 60:0.5,90:0.1",
     )
 
     def odometry_noise(self) -> OdometryNoise:
@@ -280,17 +280,18 @@ class WorldSource(IndexedSource):
         moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
         climbed = np.diff(self._heights, prepend=self._heights[:1])
         if options.kidnapped:
-            at_s, share = options.kidnapped.split(":")
-            at = max(1, round(float(at_s) * options.rate))
-            along[at:] += round(float(share) * self.frames_per_lap)
-            self._truths = lap[along % self.frames_per_lap]
-            self._heights = lap_heights[along % self.frames_per_lap]
-            climb = np.diff(self._heights, prepend=self._heights[:1])
-            climb[at : at + 1] = climbed[at : at + 1]
-            climbed = climb
-            drive = np.diff(self._truths, axis=0, prepend=self._truths[:1])
-            drive[at : at + 1] = moved[at : at + 1]  # odometry does not measure the kidnapping
-            moved = drive
+            cuts, n = [], self.frames_per_lap
+            for one in options.kidnapped.split(","):
+                at_s, share = one.split(":")
+                cuts.append(max(1, round(float(at_s) * options.rate)))
+                along[cuts[-1] :] += round(float(share) * n)
+            self._truths, self._heights = lap[along % n], lap_heights[along % n]
+            moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
+            climbed = np.diff(self._heights, prepend=self._heights[:1])
+            for at in [at for at in cuts if at < self.n_frames]:  # odometry does not measure it
+                before, after = along[at - 1] % n, (along[at - 1] + 1) % n
+                moved[at] = lap[after] - lap[before]
+                climbed[at] = lap_heights[after] - lap_heights[before]
         self.posts_m = np.empty((0, 2))
         if options.markers:
             self.world, self.posts_m = with_markers(
