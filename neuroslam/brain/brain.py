@@ -236,7 +236,10 @@ class NavigationBrain(BrainState):
         templates = self.map.experiences.array("template")
         errors, headings = self.view.compare(view)
         of_experience = np.append(errors, 1.0)[templates]  # -1, without a view: the worst error
-        found = self.tracker.judge(of_experience, self.map, motion, change, alarm)
+        voters = self._with["weigh"]
+        for population in voters:
+            population.weigh(of_experience, self.map, motion, self.tracker.tracks, alarm)
+        found = self.tracker.judge(of_experience, self.map, motion, change, alarm, voters)
         recalled = self._recall_stored(view, motion, alarm, found)
         if found.kind == "kidnapped" or (recalled and self._jumped(found)):
             self.start_new_map("kidnapped")
@@ -246,7 +249,7 @@ class NavigationBrain(BrainState):
         here = found.experience
         error = -1.0 if here == NO_EXPERIENCE else float(of_experience[here])
         limit = self.tracker.new_view or self.config.view.threshold
-        unlike = not 0.0 <= error <= limit
+        unlike = not 0.0 <= error <= limit or any(p.splits(self.map) for p in voters)
         if found.kind == "leave" or (found.kind == "explore" and unlike):
             return ViewMatch(self.view.learn(view), error, 0.0, True), found
         if found.kind == "wait":

@@ -42,6 +42,7 @@ from neuroslam.view.features import Encoder, view_encoder
 from neuroslam.view.templates import LocalViewCells
 
 if TYPE_CHECKING:
+    from neuroslam.cells.clones import CloneCells
     from neuroslam.cells.head_direction import HeadDirectionCells
     from neuroslam.cells.navigation import NavigationCells
     from neuroslam.cells.pose import PoseCellNetwork
@@ -86,6 +87,7 @@ class BrainState(QuickModule):
     head_direction: "HeadDirectionCells"
     speed: "SpeedCells"
     pose_3d: "PoseCells3D"
+    clones: "CloneCells"
     compass: Compass
     sessions: SessionLog
     recognition: Recognition
@@ -171,7 +173,9 @@ class BrainState(QuickModule):
         self.recognition = Recognition()
         self.continuity = Continuity(config)
         self.tracker: SequenceTracker | None = None
-        if config.map.closure == "sequence" and leader.relaxes_map and leader.needs_views:
+        votes = any(_overrides(cls, "weigh") for cls in population_classes(config))
+        follows = config.map.closure == "sequence" or votes
+        if follows and leader.relaxes_map and leader.needs_views:
             self.tracker = SequenceTracker(config.sequence)
             self.recognition.sequence = StoredSequence(config.sequence)
         self._changed()
@@ -214,6 +218,7 @@ class BrainState(QuickModule):
                 "follow",
                 "learn",
                 "recall",
+                "weigh",
             )
         }
         self._makes_views = any(cls.needs_views for cls in classes)

@@ -1,6 +1,6 @@
 """Tracking on the robot's own map by sequences of views, and after a kidnapping."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Literal, NamedTuple, Protocol
 
@@ -13,6 +13,7 @@ from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, within_links
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
+from neuroslam.state.population import Population
 from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_EXPERIENCE, Motion, Pose, Revoked, Tracking
@@ -151,6 +152,7 @@ class SequenceTracker(Mergeable):
         self.config = config
         self.memory = 1.0 - 1.0 / config.memory_frames
         self.seen = Seen()
+        self.voters: Sequence[Population] = ()
         self.closeness = np.empty(0)  # match errors of this frame, as a share of their mean
         self.new_view: float | None = None  # match error of a new view in this frame, where known
         # Of every experience: accumulated cost, and number of the frame that made it.
@@ -220,6 +222,7 @@ class SequenceTracker(Mergeable):
         motion: Motion,
         change: float = 0.0,
         alarm: bool = False,
+        voters: Sequence[Population] = (),
     ) -> Tracking:
         """Take the match errors of a frame into the evidence, and say where the robot is.
 
@@ -230,8 +233,10 @@ class SequenceTracker(Mergeable):
                 path a full turn counts as a metre.
             change: Difference of the view from that of the last frame.
             alarm: Whether the view changed too abruptly for driving.
+            voters: Who vote on loop closures, and propose some.
         """
         s, c, current = self.state, self.config, map_.current
+        self.voters = voters
         while self.evidence.n < map_.n:
             self.evidence.append(cost=0.0, fresh=0.0, made=s.frames)
         way_m = (abs(motion.v_m_s) + abs(motion.w_rad_s) / TWO_PI) * motion.dt_s
@@ -277,6 +282,9 @@ class SequenceTracker(Mergeable):
         def around(experience: int, back: int, ahead: int) -> np.ndarray:
             return within_links(experience, back, ahead, source, target, map_.n)
 
+        proposed = self._proposed(around, map_)
+        if proposed is not None:
+            return proposed
         if doubting:
             near = around(current, _APART, _APART + s.doubts)
             return self._doubt(costs, compared, near, around, map_)
@@ -291,11 +299,47 @@ class SequenceTracker(Mergeable):
             kind = self._closing(best, map_)
             s.mode = Mode.TRACKS
             if kind == "link":
-                offset = map_.offset
-                s.origin, s.joined, s.proved = current, best, 0
-                s.dx_m, s.dy_m, s.turn_rad = offset
+                self._begin_proof(best, map_)
             return self._go(kind, best, costs[best], rival)
         return Tracking("explore", current, -costs[best], -rival)
+
+    def _begin_proof(self, joined: int, map_: ExperienceMap) -> None:
+        """Remember where a loop closure begins, to revoke it if later frames contradict it."""
+        s = self.state
+        s.origin, s.joined, s.proved = map_.current, joined, 0
+        s.dx_m, s.dy_m, s.turn_rad = map_.offset
+
+    def _supported(self, experience: int) -> bool:
+        """Return whether all voters support that the robot is at an experience."""
+        return all(voter.supports(experience) for voter in self.voters)
+
+    def _proposed(self, around: _Around, map_: ExperienceMap) -> Tracking | None:
+        """Go where a voter is sure that the robot is, unless it is there already."""
+        s, current = self.state, map_.current
+        for voter in self.voters:
+            there = voter.proposes()
+            if there is None or not self._supported(there):
+                continue
+            if there == NO_EXPERIENCE:
+                if s.mode != Mode.TRACKS:
+                    continue
+                s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
+                return Tracking("leave", current)._replace(revoked=self._revoke())
+            here = current != NO_EXPERIENCE and (
+                around(current, _APART, _APART)[there] or _beside(current, map_)[there]
+            )
+            if here and s.mode != Mode.EXPLORES:
+                continue
+            self.evidence.array("cost")[:] = self.evidence.array("fresh")
+            explored, driven = s.mode == Mode.EXPLORES, voter.reaches(there)
+            s.mode = Mode.TRACKS
+            if driven and explored:
+                self._begin_proof(there, map_)
+            if driven:
+                return self._go("link" if explored else "at", there, 0.0, 0.0)
+            s.origin = s.joined = NO_EXPERIENCE
+            return self._go("set", there, 0.0, 0.0)
+        return None
 
     def _track(
         self,
@@ -311,6 +355,8 @@ class SequenceTracker(Mergeable):
         elsewhere = np.where(around(here, _APART, _APART), UNKNOWN, costs)
         best = int(elsewhere.argmin())
         s.bad = s.bad + 1 if costs[here] > -c.keep else 0
+        if here != current and not self._supported(here):
+            here = current  # it looks like a place farther on, but odometry contradicts
         if not s.bad and costs[here] <= elsewhere[best]:
             s.way_m, s.proved = 0.0, s.proved + 1
             if s.proved >= _PROOF:
@@ -326,6 +372,8 @@ class SequenceTracker(Mergeable):
         if self._kidnapped(around, current):
             s.mode, s.bad, s.doubts = Mode.SEARCHES, 0, c.doubt_frames
             self.evidence.array("cost")[:] = self.evidence.array("fresh")
+            return Tracking("wait", current, -costs[here], -elsewhere[best])
+        if s.bad >= c.lost_frames and not self._supported(NO_EXPERIENCE):
             return Tracking("wait", current, -costs[here], -elsewhere[best])
         if s.bad >= c.lost_frames:
             s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
@@ -380,7 +428,7 @@ class SequenceTracker(Mergeable):
         alike = s.alike / s.streak
         self.seen = seen._replace(streak=s.streak, passed=s.passed, alike=alike)
         enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
-        return enough and alike <= c.alike
+        return enough and alike <= c.alike and self._supported(best)
 
     def _jumped(self, compared: np.ndarray, around: _Around, map_: ExperienceMap) -> int:
         """Return where the robot is after a sudden change of view, or that there is no sign of one.
@@ -402,7 +450,7 @@ class SequenceTracker(Mergeable):
             return NO_EXPERIENCE
         follows = s.jumped != NO_EXPERIENCE and around(s.jumped, 1, _AHEAD)[best]
         s.jumped, s.jump_frames = best, (s.jump_frames + 1 if follows else 0)
-        if s.jump_frames < c.confirm_frames // 3:
+        if s.jump_frames < c.confirm_frames // 3 or not self._supported(best):
             return NO_EXPERIENCE
         s.mode = Mode.TRACKS
         self.evidence.array("cost")[:] = self.evidence.array("fresh")
@@ -425,7 +473,8 @@ class SequenceTracker(Mergeable):
         revoked = self._revoke()
         if revoked is None:
             return self._go(self._closing(best, map_), best, cost, rival)
-        return self._go("link", best, cost, rival)._replace(revoked=revoked)
+        kind = "link" if all(voter.reaches(best) for voter in self.voters) else "set"
+        return self._go(kind, best, cost, rival)._replace(revoked=revoked)
 
     def _revoke(self) -> Revoked | None:
         """Return the loop closure that is not proved, to be undone."""
@@ -443,7 +492,8 @@ class SequenceTracker(Mergeable):
         share, links = _REACH[self.state.since_sudden <= self.config.doubt_frames + _SETTLE]
         reach = share * self.state.way_m + links * _link_length(map_)
         self.state.since_sudden = 4 * _SETTLE  # the change is explained
-        return "link" if apart <= reach or not self.state.localised else "set"
+        driven = apart <= reach or not self.state.localised
+        return "link" if driven and all(v.reaches(best) for v in self.voters) else "set"
 
     def _go(
         self, kind: Literal["at", "link", "set"], experience: int, cost: float, rival: float

@@ -51,7 +51,8 @@ class BrainConfig(Section):
         default=("pose",),
         description="populations, joined by +, as pose+place; pose: views, pose cells and map "
         "(RatSLAM); place: boundary, grid and place cells (SLRB); semantic: landmarks (SSP-SLAM); "
-        "head_direction; speed; pose_3d: pose cells with height (NeuroSLAM); or one of your own",
+        "head_direction; speed; pose_3d: pose cells with height (NeuroSLAM); clones: places that "
+        "look the same; or one of your own",
     )
     frame_rate_hz: float = Field(
         default=20.0, gt=0, description="frame rate, where the source has no time stamps"

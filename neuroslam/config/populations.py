@@ -20,6 +20,7 @@ HOMES = {
     "head_direction": "neuroslam.cells.head_direction",
     "speed": "neuroslam.cells.speed",
     "pose_3d": "neuroslam.cells.pose_3d",
+    "clones": "neuroslam.cells.clones",
 }
 """Module of each of the package's own kinds, in the order in which a brain steps them."""
 

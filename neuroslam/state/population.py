@@ -25,7 +25,15 @@ from neuroslam.state.mergeable import (
     renumbered_by_rules,
 )
 from neuroslam.state.renumbering import Renumbering
-from neuroslam.types import Frame, Motion, Pose, PoseEstimate, Tracking, ViewMatch
+from neuroslam.state.tables import GrowingTable
+from neuroslam.types import (
+    Frame,
+    Motion,
+    Pose,
+    PoseEstimate,
+    Tracking,
+    ViewMatch,
+)
 
 Action = Literal["none", "create", "link", "set"]
 Observation = Any
@@ -253,6 +261,46 @@ class Population(Mergeable):
         """Tell whether the robot cannot be where a view was learnt."""
         return False
 
+    def weigh(
+        self,
+        errors: np.ndarray,
+        map_: "LeadableMap",
+        motion: Motion,
+        tracks: bool,
+        alarm: bool,
+    ) -> None:
+        """Weigh where on the robot's own map it is; a population that overrides this votes.
+
+        It is asked in every frame with a view, before loops are closed by sequences of views, which
+        the brain then does whatever ``map.closure`` is.
+
+        Args:
+            errors: Match error of the frame with the view of every experience, ``(n,)``.
+            map_: The map.
+            motion: Since the last frame.
+            tracks: Whether the robot is believed on known ground.
+            alarm: Whether the view changed too abruptly for driving.
+        """
+
+    def supports(self, experience: int) -> bool:
+        """Vote on whether the robot is at an experience; -1: on ground that is not mapped."""
+        return True
+
+    def reaches(self, experience: int) -> bool:
+        """Vote on whether it can have driven there: else it was kidnapped, and no link is made."""
+        return True
+
+    def proposes(self) -> int | None:
+        """Return the experience that the robot is at for sure.
+
+        Returns:
+            Its id; -1: the robot is on ground that is not mapped; ``None``: it is not sure.
+        """
+
+    def splits(self, map_: "LeadableMap") -> bool:
+        """Vote for an experience on unknown ground although the view did not change."""
+        return False
+
     def follow(self, correction: Correction) -> None:
         """Follow what another population has corrected."""
 
@@ -436,7 +484,13 @@ class Population(Mergeable):
 
 
 class LeadableMap(Protocol):
-    """What a leader uses of :class:`~neuroslam.mapping.experience.ExperienceMap`."""
+    """What a leader uses of :class:`~neuroslam.mapping.experience.ExperienceMap`.
+
+    Attributes:
+        links_table: Its links: ``source``, ``target``, ``distance_m``, ``facing_rad``.
+    """
+
+    links_table: GrowingTable
 
     @property
     def n(self) -> int:

@@ -5,6 +5,12 @@ import torch
 
 from neuroslam.cells.boundary import BoundaryCells
 from neuroslam.cells.boundary_sheet import BoundarySheet
+from neuroslam.cells.clone_steps import (
+    SPREAD,
+    TURN_SPREAD,
+    advance_belief_of_arrays,
+    advance_belief_step,
+)
 from neuroslam.cells.familiarity import Familiarity
 from neuroslam.cells.grid import LAHNGridCells
 from neuroslam.cells.head_direction import (
@@ -269,6 +275,21 @@ def head_direction(rng):
         theirs = inject_step(theirs, cue, share / 2, order, bump)
         pairs.append((ours, theirs))
     return pairs
+
+
+@case("cells.clone_steps.advance_belief_step")
+def belief_of_clones(rng):
+    n = int(rng.integers(5, 60))
+    links = [np.arange(n - 1), np.arange(1, n)]
+    extra = rng.integers(0, n, (2, int(rng.integers(0, 20))))
+    source, target = (np.concatenate(pair) for pair in zip(links, extra, strict=True))
+    belief = rng.random(n) * (rng.random(n) < 0.5)
+    since = np.column_stack([rng.uniform(0.0, 1.0, n), rng.normal(0.0, 0.3, n)])
+    length, facing = rng.uniform(0.05, 1.0, len(source)), rng.normal(0.0, 0.5, len(source))
+    moved = float(rng.uniform(0.0, 0.5)), float(rng.normal(0.0, 0.2))
+    rows = belief, since, source, target, length, facing, moved, 0.5
+    steps = advance_belief_step(*rows, SPREAD, TURN_SPREAD)
+    return [*zip(advance_belief_of_arrays(*rows), steps, strict=True)]
 
 
 @case("worlds.arena.cast_step")

@@ -14,6 +14,7 @@ from neuroslam.cells.head_direction import HeadDirectionConfig
 from neuroslam.cells.pose_3d import Pose3DConfig
 from neuroslam.cells.speed import SpeedCellConfig
 from neuroslam.config import BrainConfig, Section
+from neuroslam.config.clones import CloneConfig
 from neuroslam.config.semantic import SSPSLAMConfig
 from neuroslam.ros.settings import RosSettings
 from neuroslam.spiking.slam import SSPSLAM
@@ -39,6 +40,7 @@ ALL = {
         HeadDirectionConfig,
         SpeedCellConfig,
         Pose3DConfig,
+        CloneConfig,
         RosSettings,
     )
     for each in sections(section)
