@@ -29,6 +29,7 @@ def test_there_are_notebooks():
         "05_semantic_map",
         "06_three_dimensions",
         "07_live_fleet",
+        "08_same_places",
     ]
 
 
