@@ -30,15 +30,11 @@ class Velocity(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Self-motion since the previous frame: speed, turn rate, and duration in seconds.
-
-    ``v_z_m_s`` is the speed upwards, ``v_m_s`` then the horizontal one; 0 in the plane.
-    """
+    """Self-motion since the previous frame: speed, turn rate, and duration in seconds."""
 
     v_m_s: float
     w_rad_s: float
     dt_s: float
-    v_z_m_s: float = 0.0
 
 
 class Frame(NamedTuple):

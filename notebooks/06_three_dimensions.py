@@ -52,7 +52,7 @@ plt.rcParams.update(STYLE | {"figure.constrained_layout.use": True, "figure.dpi"
 # %%
 cells = PoseCells3D(PoseCellConfig(cell_size_m=0.5))
 for _ in range(30):
-    cells.integrate(Motion(v_m_s=1.0, w_rad_s=0.4, dt_s=0.1, v_z_m_s=0.3))
+    cells.integrate(Motion(v_m_s=1.0, w_rad_s=0.4, dt_s=0.1), v_z_m_s=0.3)
 volume, sheet = cells.grid.activity.numpy(), cells.sheet.activity.numpy()
 figure, axes = plt.subplots(1, 4, figsize=(12.5, 3.2))
 views = (("x", "y", 0), ("x", "z", 1), ("y", "z", 2))
@@ -80,7 +80,7 @@ wanted, found = [at], [at]
 for _ in range(240):
     heading = 2 * math.pi * wanted[-1][3] / 36
     wanted.append(wanted[-1] + [0.2 * math.cos(heading), 0.2 * math.sin(heading), 0.06, 0.3])
-    now = np.array(cells.integrate(Motion(1.0, 0.3 * math.pi / 1.8, 0.1, 0.3)))
+    now = np.array(cells.integrate(Motion(1.0, 0.3 * math.pi / 1.8, 0.1), 0.3))
     found.append(found[-1] + (now - found[-1] + sizes / 2) % sizes - sizes / 2)
 wanted, found = np.array(wanted), np.array(found)
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.8))

@@ -213,8 +213,10 @@ class NavigationBrain(BrainState):
             match, tracking = self._track(view, Motion(*velocity, dt_s), change, alarm)
         if not self.sessions.sessions:
             self._name_session(frame, accepted.observed)
-        motion = Motion(*velocity, dt_s, climb)
-        return StepInput(frame.index, motion, match, frame.heading_rad, tracking=tracking)
+        motion = Motion(*velocity, dt_s)
+        return StepInput(
+            frame.index, motion, match, frame.heading_rad, tracking=tracking, v_z_m_s=climb
+        )
 
     def _hidden(self) -> np.ndarray | None:
         """Return which templates cannot match, ``bool (n,)``: those of excluded experiences."""

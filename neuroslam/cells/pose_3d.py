@@ -108,9 +108,9 @@ class PoseCells3D(Population):
     Example:
         >>> cells = PoseCells3D(PoseCellConfig(cell_size_m=0.5))
         >>> start = cells.estimate_3d
-        >>> after = cells.integrate(Motion(v_m_s=1.0, w_rad_s=0.0, dt_s=0.5, v_z_m_s=0.5))
+        >>> after = cells.integrate(Motion(v_m_s=1.0, w_rad_s=0.0, dt_s=0.5), v_z_m_s=0.5)
         >>> round(start.x - after.x, 2), round(after.z - start.z, 2)  # it starts heading along -x
-        (0.99, 0.49)
+        (1.0, 0.5)
     """
 
     name = "pose_3d"
@@ -189,7 +189,7 @@ class PoseCells3D(Population):
         x, y, _, theta = self.estimate_3d
         return PoseEstimate(x, y, theta)
 
-    def integrate(self, motion: Motion) -> PoseEstimate3D | Tensor:
+    def integrate(self, motion: Motion, v_z_m_s: float | Tensor = 0.0) -> PoseEstimate3D | Tensor:
         """Settle both attractors, move their activity by ``motion``, and return the estimate.
 
         The lag of the estimates behind odometry is measured and compensated for, as in
@@ -197,8 +197,8 @@ class PoseCells3D(Population):
         jumped, or a view has just injected.
 
         Args:
-            motion: m/s, rad/s, s and m/s upwards; in a batch all but the time are tensors of shape
-                ``(batch,)``.
+            motion: m/s, rad/s, s; in a batch the first two are tensors of shape ``(batch,)``.
+            v_z_m_s: Speed upwards; in a batch likewise.
 
         Returns:
             x, y, z and heading in cells; in a batch ``(batch, 4)``.
@@ -208,7 +208,7 @@ class PoseCells3D(Population):
         """
         c = self.config
         ahead = motion.v_m_s * motion.dt_s / c.cell_size_m
-        up = motion.v_z_m_s * motion.dt_s / self.settings.cell_height_m
+        up = v_z_m_s * motion.dt_s / self.settings.cell_height_m
         turn = motion.w_rad_s * motion.dt_s * c.n_theta / TWO_PI
         follows = c.exact_gain and not self.now.injected
         if not follows:
@@ -363,8 +363,8 @@ class PoseCells3D(Population):
     def step(self, now: StepInput, observation: Observation) -> None:
         """Advance by a frame of the brain: inject by the view, settle, move by odometry."""
         self.update_from_view(now.view)
-        self.integrate(now.motion)
-        self.now.rise_m += now.motion.v_z_m_s * now.motion.dt_s
+        self.integrate(now.motion, now.v_z_m_s)
+        self.now.rise_m += now.v_z_m_s * now.motion.dt_s
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose-cell estimate."""

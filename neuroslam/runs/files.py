@@ -253,7 +253,7 @@ class RowWriter:
         line = ",".join([line, *(repr(float(v)) for v in more_columns(brain).values())]) + "\n"
         self._append("frames.csv", line.encode())
         truth = frame.truth or (math.nan, math.nan, math.nan)
-        row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion[:3], *truth)
+        row = (r.time_s, *brain.map.origin, *brain.map.offset, *r.motion, *truth)
         self._append("trace.f64", np.array(row, dtype="<f8").tobytes())
 
     def _append(self, name: str, row: bytes) -> None:

@@ -56,6 +56,7 @@ class StepInput(NamedTuple):
         tracking: What the sequence of views says; ``None``: each view decides by itself.
         cells_heading_rad: Heading that a population represents; ``None``: none does.
         cells_speed_m_s: Speed that a population represents, likewise.
+        v_z_m_s: Measured speed upwards; that of ``motion`` is then horizontal. 0 in the plane.
     """
 
     frame: int
@@ -66,6 +67,7 @@ class StepInput(NamedTuple):
     tracking: Tracking | None = None
     cells_heading_rad: float | None = None
     cells_speed_m_s: float | None = None
+    v_z_m_s: float = 0.0
 
 
 class Correction(NamedTuple):

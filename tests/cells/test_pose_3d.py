@@ -41,7 +41,7 @@ def test_a_rise_and_a_fall_end_where_they_began():
     cells = PoseCells3D(EXACT)
     start = cells.estimate_3d
     for up in [0.8] * 25 + [-0.8] * 25:
-        cells.integrate(Motion(0.0, 0.0, DT_S, up))
+        cells.integrate(Motion(0.0, 0.0, DT_S), up)
     np.testing.assert_allclose(cells.estimate_3d, start, atol=0.02)
 
 
@@ -54,7 +54,7 @@ def test_the_estimate_follows_odometry_in_all_four_directions(v, w, up):
         heading = TWO_PI * at[3] / 36
         step = v * math.cos(heading) / 5, v * math.sin(heading) / 5, up / 5
         at += (*step, w * DT_S * 36 / TWO_PI)
-        found = cells.integrate(Motion(v, w, DT_S, up))
+        found = cells.integrate(Motion(v, w, DT_S), up)
     sizes = np.array([21, 21, 21, 36])
     assert np.abs(apart(np.array(found), at, sizes)).max() < 0.3
     assert abs(apart(cells.sheet.estimate[0], at[2], 21)) < 0.3  # both networks know the height
@@ -76,10 +76,10 @@ def test_a_batch_gives_what_each_robot_gives_alone(precision):
     alone = [PoseCells3D(config) for _ in range(3)]
     v, w, up = torch.tensor([[0.5, -0.3, 0.0], [0.4, 0.0, -1.0], [0.0, 0.6, -0.4]]).double()
     for _ in range(12):
-        found = together.integrate(Motion(v, w, DT_S, up))
+        found = together.integrate(Motion(v, w, DT_S), up)
         for one, motion in zip(alone, zip(v, w, up, strict=True), strict=True):
             a, b, c = (m.item() for m in motion)
-            one.integrate(Motion(a, b, DT_S, c))
+            one.integrate(Motion(a, b, DT_S), c)
     expected = torch.tensor([one.estimate_3d for one in alone], dtype=torch.float64)
     torch.testing.assert_close(
         found.double(), expected, atol=2e-3 if precision == "float32" else 1e-7, rtol=0.0
@@ -119,7 +119,7 @@ def test_a_view_brings_height_and_heading_back():
     bound = cells.estimate_3d
     cells.update_from_view(ViewMatch(0, -1.0, 0.0, True))
     for _ in range(10):
-        cells.integrate(Motion(0.2, 0.3, DT_S, 1.0))
+        cells.integrate(Motion(0.2, 0.3, DT_S), 1.0)
     assert abs(cells.estimate_3d.z - bound.z) > 1.5
     for _ in range(12):
         cells.update_from_view(ViewMatch(0, 0.0, 0.0, False))

@@ -30,7 +30,7 @@ def _a_few_frames_of_pose_cells_in_3d(draw):
         found = []
         for view in (ViewMatch(0, 0.0, 0.3, False), ViewMatch(-1, -1.0, 0.0, False)):
             cells.update_from_view(view)
-            cells.integrate(Motion(v, w, 0.4, up))
+            cells.integrate(Motion(v, w, 0.4), up)
             found += [cells.grid.activity.numpy(), cells.sheet.activity.numpy()]
         return found
 
