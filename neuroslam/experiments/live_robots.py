@@ -33,7 +33,7 @@ POLL_S = 0.25
 
 
 def _started(target: Any, arguments: list[tuple[Any, ...]]) -> list[BaseProcess]:  # noqa: ANN401
-    context = worker_context()
+    context: Any = worker_context()
     robots: list[BaseProcess] = [context.Process(target=target, args=one) for one in arguments]
     for robot in robots:
         robot.start()
@@ -224,7 +224,7 @@ def hundred_robots(out: Path, n: int = 100, seconds: int = 20) -> dict[str, Any]
     folder = _emptied(out / "hundred")
     with Journal(folder, BrainConfig()):
         pass
-    context = worker_context()
+    context: Any = worker_context()
     answers: Any = context.Queue()
     halves = [range(0, n // 2), range(n // 2, n)]
     robots = _started(_drive_many, [(half, folder, seconds, answers) for half in halves])
