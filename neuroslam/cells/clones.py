@@ -20,13 +20,13 @@ from neuroslam.cells.clone_steps import (
     reach,
     view_evidence,
 )
-from neuroslam.cells.pose import register
 from neuroslam.config import BrainConfig
 from neuroslam.config.clones import CloneConfig
 from neuroslam.geometry import TWO_PI
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import State, without_gradients
 from neuroslam.state.population import LeadableMap, Picture, Population
+from neuroslam.state.registry import register
 from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_EXPERIENCE, Motion, Pose

@@ -24,7 +24,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neuroslam.cells.grid_3d import GridCells3D
-from neuroslam.cells.pose import SATURATED_DECAY, register
+from neuroslam.cells.pose import SATURATED_DECAY
 from neuroslam.cells.pose_3d_states import differing_heights, merge_pose_3d, state_faults
 from neuroslam.cells.pose_joining import move_session
 from neuroslam.cells.yaw_height import YawHeightCells
@@ -46,6 +46,7 @@ from neuroslam.state.population import (
     Population,
     StepInput,
 )
+from neuroslam.state.registry import register
 from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
 from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
