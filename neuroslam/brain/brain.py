@@ -242,7 +242,7 @@ class NavigationBrain(BrainState):
         for population in voters:
             population.weigh(of_experience, self.map, motion, self.tracker.tracks, alarm)
         found = self.tracker.judge(of_experience, self.map, motion, change, alarm, voters)
-        recalled = self._recall_stored(view, motion, alarm, found)
+        recalled = self._recall_stored(view, motion, change, alarm, found)
         if found.kind == "kidnapped" or (recalled and self._jumped(found)):
             self.start_new_map("kidnapped")
             return self.view.match_or_learn(view), Tracking("explore", self.map.current)
@@ -261,7 +261,7 @@ class NavigationBrain(BrainState):
         return ViewMatch(template, error, heading, False), found
 
     def _recall_stored(
-        self, view: np.ndarray, motion: Motion, alarm: bool, found: Tracking
+        self, view: np.ndarray, motion: Motion, change: float, alarm: bool, found: Tracking
     ) -> bool:
         """Return whether the sequence of views shows a place of a stored map."""
         assert self.recognition.sequence is not None
@@ -271,17 +271,15 @@ class NavigationBrain(BrainState):
         if alarm or known:
             self.recognition.sequence.forget()
         moves = motion.v_m_s != 0.0 or motion.w_rad_s != 0.0
-        return not known and moves and self._judge_stored(view)
+        return not known and moves and self._judge_stored(view, change)
 
     def _jumped(self, found: Tracking) -> bool:
         """Return whether a sudden change of view began the sequence that a stored map explains.
 
         Then odometry does not connect the place with the present map.
         """
-        assert self.tracker is not None
         assert self.recognition.sequence is not None
-        sequence = self.recognition.sequence.state.streak + self.config.sequence.memory_frames
-        return found.kind == "wait" or self.tracker.state.since_sudden <= sequence
+        return found.kind == "wait" or self.recognition.sequence.after_jump
 
     def _exchange(self, made: Sequence[tuple[Population | None, Correction | None]]) -> None:
         """Apply corrections to the map and to all populations but their authors."""

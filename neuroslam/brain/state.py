@@ -416,12 +416,12 @@ class BrainState(QuickModule):
             )
         return self._stored_views
 
-    def _judge_stored(self, encoded: np.ndarray) -> bool:
+    def _judge_stored(self, encoded: np.ndarray, change: float) -> bool:
         """Return whether the sequence of views shows a place of a stored map."""
         if self.recognition.sequence is None or not len(self.stored):
             return False
         stored = self._searched
-        return self.recognition.sequence.judge(stored.compare(encoded)[0], stored.graph)
+        return self.recognition.sequence.judge(stored.compare(encoded)[0], stored.graph, change)
 
     def _recognise_sequence(self, frame: Frame, encoded: np.ndarray, view: ViewMatch) -> bool:
         """Join a stored map if the sequence of views shows a place of it, and track it there."""

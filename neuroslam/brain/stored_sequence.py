@@ -16,6 +16,8 @@ from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE
 
 _APART = 6  # links within which two experiences are the same part of a map
 _AHEAD = 3  # links that the robot may pass in a frame
+_SUDDEN = 0.75  # change between two frames, as a share of the mean match error
+_LONG = 1_000_000  # frames: no sudden change was seen
 _BESIDE = 2.5, 0.8  # distance in median links, and heading in rad, up to which two are one place
 
 
@@ -83,6 +85,7 @@ class _Streak(Scalars):
         passed: Experiences that the candidates have passed since.
         alike: Match error with the candidates, as a share of the mean one, summed over the streak.
         error: Match error with the present candidate.
+        since_sudden: Frames since the view changed much between two frames.
     """
 
     frames: int
@@ -92,6 +95,7 @@ class _Streak(Scalars):
     passed: int
     alike: float
     error: float
+    since_sudden: int
 
 
 class StoredSequence(Mergeable):
@@ -111,7 +115,7 @@ class StoredSequence(Mergeable):
         self.evidence = GrowingTable({"cost": ((), torch.float64)})
         self.state = _Streak(
             frames=0, streak=0, candidate=NO_EXPERIENCE, began=NO_EXPERIENCE, passed=0,
-            alike=0.0, error=1.0,
+            alike=0.0, error=1.0, since_sudden=_LONG,
         )  # fmt: skip
 
     @classmethod
@@ -144,12 +148,18 @@ class StoredSequence(Mergeable):
         enough = s.streak >= c.confirm_frames and s.passed >= c.confirm_experiences
         return enough and s.alike <= c.alike * s.streak
 
-    def judge(self, errors: np.ndarray, graph: StoredGraph) -> bool:
+    @property
+    def after_jump(self) -> bool:
+        """Whether a sudden change of view came shortly before the frames that agree."""
+        return self.state.since_sudden <= self.state.streak + self.config.memory_frames
+
+    def judge(self, errors: np.ndarray, graph: StoredGraph, change: float = 0.0) -> bool:
         """Take the match errors of a frame of a moving robot into the evidence.
 
         Args:
             errors: Match error with the view of every experience, ``(n,)``.
             graph: The stored maps.
+            change: Difference of the view from that of the last frame.
 
         Returns:
             Whether a place is believed: ``state.candidate``.
@@ -159,6 +169,8 @@ class StoredSequence(Mergeable):
             return False
         while self.evidence.n < graph.n:
             self.evidence.append(cost=0.0)
+        sudden = change > _SUDDEN * float(errors.mean())
+        s.since_sudden = 0 if sudden else min(s.since_sudden + 1, _LONG)
         relative = relative_errors(errors, np.ones(graph.n, dtype=bool))
         memory = min(1.0 - 1.0 / c.memory_frames, s.frames / (1.0 + s.frames))
         before = self.evidence.array("cost")

@@ -57,6 +57,17 @@ def test_it_joins_its_first_map_within_two_seconds_and_makes_no_experience_twice
     assert len(robot.stored) == 1  # the unknown place
 
 
+def test_a_session_that_begins_on_a_stored_map_is_one_map_with_it(away):
+    (lap,) = away.stored
+    robot = brain()
+    robot.store(lap)
+    for frame in back(0.3 + np.arange(SOON + 20) / LAP, 0):
+        robot(frame)
+    assert len(robot.sessions.merges) == 1
+    assert not robot.stored
+    assert len(robot.sessions.sessions) == 2
+
+
 def test_another_unknown_place_is_not_joined(away):
     robot, first = copy_of(away), round(1.5 * LAP) + AWAY
     for frame in drive(laps(0.6) / 3, strip(11, 7200), first, seed=4):
