@@ -21,11 +21,11 @@ from neuroslam.cli.options import (
     OnBadFrame,
     Out,
     Overwrite,
-    Preset,
     Record,
     RecordRate,
     RobotName,
     RunFolder,
+    RunPreset,
     SaveEvery,
     Smooth,
     Source,
@@ -48,9 +48,9 @@ def run_command(
     source: Source,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write; required but for --dry-run."),
+        typer.Option("--out", "-o", help="Folder to write; not needed with --dry-run."),
     ] = None,
-    preset: Preset = None,
+    preset: RunPreset = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
     maps: Annotated[
@@ -409,10 +409,11 @@ def _report(summary: "RunSummary", out: Path, command: str) -> int:
         )
     for line in _accuracy_lines(summary):
         say(line)
-    say(f"Written: {out}")
+    done = not summary.failure and not summary.interrupted
+    say(f"Written: {out}" + (f"; next: neuroslam report {out}" if done else ""))
     if summary.failure:
         skips = summary.bad_frame and command == "run"
-        hint = "; or leave out such frames: --on-bad-frame skip" if skips else ""
+        hint = "; to leave out such frames: --on-bad-frame skip" if skips else ""
         complain(command, f"stopped early: {summary.failure}{hint}")
         return USER_ERROR
     if summary.interrupted:

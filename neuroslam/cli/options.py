@@ -47,8 +47,8 @@ Source = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="Video, folder or tar of images, image list, CSV of motion, npz trajectory, "
-        "TUM, KITTI, EuRoC or donkeycar folder, ROS bag, camera:0, VIDEO+MOTION.csv, arena:NAME or "
-        "world:NAME.",
+        "TUM, KITTI, EuRoC or donkeycar folder, ROS bag, camera:0, VIDEO+MOTION.csv, CSV of "
+        "an animal's positions, arena:NAME or world:NAME.",
     ),
 ]
 Landmarks = Annotated[
@@ -88,7 +88,11 @@ Columns = Annotated[
 ]
 Units = Annotated[
     str | None,
-    typer.Option(metavar="UNITS", help="Units of an animal's track, as cm,deg,ms."),
+    typer.Option(
+        metavar="UNITS",
+        help="Units of an animal's track, as cm,deg,ms; "
+        "default: those in the names of its columns, else m, rad, and s by the size of the steps.",
+    ),
 ]
 ArenaOf = Annotated[
     str | None,
@@ -116,7 +120,18 @@ RecordRate = Annotated[
 Sources = Annotated[list[str], typer.Argument(metavar="SOURCE...", help="As for `run`.")]
 Preset = Annotated[
     str | None,
-    typer.Option(help="A preset; see `neuroslam presets`.", autocompletion=complete_preset),
+    typer.Option(
+        help="A preset; see `neuroslam presets`.",
+        autocompletion=complete_preset,
+    ),
+]
+RunPreset = Annotated[
+    str | None,
+    typer.Option(
+        help="A preset, see `neuroslam presets`; default with images: auto, which estimates "
+        "parameters from them.",
+        autocompletion=complete_preset,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option(help="TOML, or an OpenRatSLAM .ini/.txt; overrides the preset.")

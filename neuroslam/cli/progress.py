@@ -56,6 +56,10 @@ class _Lines:
         output.complain(output.report().command, f"{text()}, {clock(now - self.began)} elapsed")
 
 
+_COMPILES = 10
+"""Frames in which steps may be compiled, so that their rate predicts nothing."""
+
+
 def clock(seconds: float) -> str:
     """Format a duration as a clock shows it.
 
@@ -175,7 +179,7 @@ def show_frames(
                 return
             last = now
             rate = rate_of(now, done)
-            left = remaining(result.frame + 1, end, rate)
+            left = remaining(result.frame + 1, end, rate) if done > _COMPILES else ""
             bar.update(
                 task,
                 completed=result.frame + 1, rate=rate, left=left or clock(now - began),

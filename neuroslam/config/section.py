@@ -52,7 +52,7 @@ class Section(BaseModel):
         raise ValidationError.from_exception_data(cls.__name__, lines)
 
 
-_WITH_HINTS = ("unknown_key", "literal_error")
+_WITH_HINTS = ("unknown_key", "literal_error", "tuple_type", "list_type")
 
 
 def _with_hint(section: type[BaseModel], error: ErrorDetails) -> InitErrorDetails:
@@ -73,6 +73,8 @@ def _with_hint(section: type[BaseModel], error: ErrorDetails) -> InitErrorDetail
         kind, message = "unknown_key", f"unknown key {key!r}{hint}"
     elif kind == "literal_error" and "did you mean" not in message:
         message += _suggest_choice(error)
+    elif kind in ("tuple_type", "list_type"):
+        message = "expected a list in brackets, such as [1, 2]"
     return InitErrorDetails(
         type=verbatim_error(kind, message, context), loc=error["loc"], input=error["input"]
     )

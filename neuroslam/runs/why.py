@@ -198,6 +198,12 @@ def _explain(brain: NavigationBrain, frame: Frame, visited: dict[tuple[int, int]
         verdict = "A stored map was recognised and joined at this frame."
     elif closed:
         verdict = f"A loop was closed to experience {reached}: every check passed."
+    elif result.action == "none" and brain.tracker is not None and brain.tracker.tracks:
+        made = int(brain.map.experiences["first_frame"][reached])
+        verdict = (
+            f"No loop to close: the robot is at experience {reached} already, made at frame "
+            f"{made}. The checks are those of a jump to another part of the map."
+        )
     else:
         verdict = _verdict(checks, result)
     stored = brain.not_joined()
@@ -276,12 +282,14 @@ def _checks(
 
 def _checks_of_tracker(seen: Seen, limits: SequenceConfig) -> list[Check]:
     """List the checks of a loop closure by a sequence of views, as the tracker made them."""
-    above, least = "standard deviations, above", "at least"
+    above, least = "standard deviations more than", "at least"
     lead = seen.evidence - seen.rival
+    none = seen.candidate == NO_EXPERIENCE
+    candidate = "an experience" if none else f"experience {seen.candidate}"
     rows: list[tuple[str, float, float, bool, str]] = [
         ("experiences compared", seen.compared, limits.min_experiences,
          seen.compared >= limits.min_experiences, least),
-        (f"evidence for experience {seen.candidate}", seen.evidence, limits.believe,
+        (f"evidence for {candidate}", seen.evidence, limits.believe,
          seen.evidence > limits.believe, above),
         ("its lead over any other part of the map", lead, limits.margin,
          lead > limits.margin, above),

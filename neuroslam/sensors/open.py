@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from neuroslam.errors import SourceError
+from neuroslam.errors import SourceError, did_you_mean
 from neuroslam.sensors.camera import CameraSource
 from neuroslam.sensors.carmen import is_carmen, open_carmen
 from neuroslam.sensors.datasets import open_dataset
@@ -31,6 +31,7 @@ from neuroslam.sensors.source import Source
 from neuroslam.sensors.streams import Streams
 from neuroslam.sensors.tracks import (
     TrackSource,
+    has_positions,
     header_and_rows,
     parse_motion,
     read_positions,
@@ -63,6 +64,7 @@ def open_source(
     ``frames.tar.gz``                    (:mod:`neuroslam.sensors.images`)
     ``list.txt``, ``list.csv``           image list (:mod:`neuroslam.sensors.images`)
     ``motion.csv``                       speed and turn rate (:mod:`neuroslam.sensors.tracks`)
+    ``rat.csv``, with x and y            as ``track:rat.csv``
     ``path.npz``, ``path.npy``           positions (:mod:`neuroslam.sensors.tracks`)
     ``rat.npz`` with an arena in it      positions and walls (:mod:`neuroslam.worlds.rodent`)
     TUM, KITTI, EuRoC, TUM-VI folder     images and truth (:mod:`neuroslam.sensors.datasets`)
@@ -131,7 +133,9 @@ def open_source(
         if not path.exists():
             if "://" in str(spec):
                 raise SourceError(f"{spec}: is an address; open it as a camera: camera:{spec}")
-            raise SourceError(f"{path}: no such file or folder; expected {_KINDS}")
+            beside = path.parent.iterdir() if path.parent.is_dir() else ()
+            near = did_you_mean(path.name, (one.name for one in beside))
+            raise SourceError(f"{path}: no such file or folder{near}; expected {_KINDS}")
         return _opener(path)(path, rate, grey)
     except OSError as error:
         raise SourceError(f"{spec}: cannot be read ({error.strerror or error})") from None
@@ -291,24 +295,32 @@ def _opener(path: Path) -> Callable[[Path, float, GreyRule], Source]:
     if name.endswith((".npz", ".npy")):
         return _open_positions
     if name.endswith(".nwb"):
-        return _open_nwb
+        return _open_animal
     what = "is a single image" if is_image_name(name) else "is of no known kind"
     raise SourceError(f"{path}: {what}; expected {_KINDS}")
 
 
 def _open_folder(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
     """Open a folder as a dataset if it has the layout of one, else as a folder of images."""
+    if (path / "brain.safetensors").is_file() and (path / "config.toml").is_file():
+        raise SourceError(
+            f"{path}: is the folder of a run, not a recording; expected what it was made from, or "
+            f"continue it: neuroslam resume {path}"
+        )
     return open_dataset(path, frame_rate_hz, grey) or open_folder(path, frame_rate_hz, grey)
 
 
 def _open_table(path: Path, frame_rate_hz: float, grey: GreyRule) -> Source:
-    """Open a text file: an image list if one of its first lines names an image, else motion."""
+    """Open a text file: an image list if one of its first lines names an image, else by header."""
     text = read_text(path)
     for row in _first_rows(text, 10):
         if any(is_image_name(word) for field in row for word in field.split()):
             return open_image_list(path, frame_rate_hz, grey)
-    if is_sightings(header_and_rows(text, str(path))[0]):
+    header = header_and_rows(text, str(path))[0]
+    if is_sightings(header):
         return parse_sightings(text, str(path))
+    if has_positions(header):
+        return _open_animal(path, frame_rate_hz, grey)
     return TrackSource(parse_motion(text, str(path)), frame_rate_hz)
 
 
@@ -318,8 +330,8 @@ def _first_rows(text: str, n: int) -> Iterator[list[str]]:
         yield from csv.reader(text[:100_000].splitlines()[:n])
 
 
-def _open_nwb(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
-    """Open the path of an animal in a file of Neurodata Without Borders."""
+def _open_animal(path: Path, frame_rate_hz: float, _: GreyRule) -> Source:
+    """Open the path of an animal, a table or a file of Neurodata Without Borders."""
     from neuroslam.worlds.animal_tracks import open_animal_track
 
     return open_animal_track(f"track:{path}")

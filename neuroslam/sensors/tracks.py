@@ -15,6 +15,7 @@ A track is an ``.npz`` with the positions ``pos``, ``(n, 2)`` in metres, and the
 import csv
 import io
 import math
+import re
 import struct
 import tokenize
 import zipfile
@@ -57,6 +58,7 @@ _EXPECTED = (
     "expected v_m_s,w_rad_s (or vtrans,vrot), optionally time_s, gyro_rad_s, v_z_m_s and "
     "x_m,y_m,theta_rad"
 )
+_X = re.compile(r"(?:p|pos_?|position_?)?x(?:_?pos)?(?:[_ \[(].*)?")
 
 
 MAX_SPEED = 1e6
@@ -264,6 +266,18 @@ def parse_motion(text: str, name: str) -> Track:
         table.get(_GYROSCOPE),
         table.get(_CLIMB),
     )
+
+
+def has_positions(header: Sequence[str]) -> bool:
+    """Return whether the header of a table names positions, and no motion.
+
+    Example:
+        >>> has_positions(["time_ms", "x_cm", "y_cm"]), has_positions(["v_m_s", "w_rad_s", "x_m"])
+        (True, False)
+    """
+    fields = [field.strip().lstrip("#").strip().lower() for field in header]
+    moves = any(_ALIASES.get(field, field) in _MOTION for field in fields)
+    return not moves and any(_X.fullmatch(field) for field in fields)
 
 
 class Table(NamedTuple):

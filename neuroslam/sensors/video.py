@@ -182,7 +182,10 @@ class VideoSource(Source):
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG if ffmpeg else cv2.CAP_ANY)
         try:
             if not capture.isOpened():
-                raise SourceError(f"{self.name}: cannot be read; expected a complete video file")
+                raise SourceError(
+                    f"{self.name}: cannot be read; expected a complete video file; "
+                    f"copy it again, or convert it: ffmpeg -i {self.path.name} copy.mp4"
+                )
             yield capture
         finally:
             capture.release()

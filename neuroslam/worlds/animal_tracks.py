@@ -20,6 +20,7 @@ from neuroslam.worlds.arena import Arena, named_arena
 from neuroslam.worlds.rodent import Walk
 from neuroslam.worlds.senses import NO_NOISE, ArenaSource
 from neuroslam.worlds.track_files import (
+    FASTEST_M_S,
     NAMES,
     RawTrack,
     as_raw,
@@ -27,9 +28,6 @@ from neuroslam.worlds.track_files import (
     parse_units,
     read_track_file,
 )
-
-FASTEST_M_S = 2.0
-"""Speed above which a step of a rat is reported as a jump of the tracking."""
 
 _FARTHEST_M = 1e8  # farther than coordinates of any map
 _HULL_M = 0.02  # by how much the outline of a track may differ from its hull

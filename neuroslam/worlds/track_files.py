@@ -36,6 +36,10 @@ _UNIT = re.compile(
     rf"^(.+?)(?:_| *[\[(] *)({'|'.join(sorted((*_LENGTHS, *_ANGLES, *_PIXELS), key=len)[::-1])})"
     r" *[\])]?$"
 )
+FASTEST_M_S = 2.0
+"""Speed above which a step of a rat is reported as a jump of the tracking."""
+
+_ENOUGH = 20  # steps whose median speed shows a wrong unit
 _MOST_RAD = TWO_PI + 0.1
 """A larger head direction is in degrees, or unwrapped."""
 
@@ -174,7 +178,8 @@ def as_raw(
         units: Given by the user.
 
     Raises:
-        SourceError: If positions are in pixels, or head directions in no known unit.
+        SourceError: If positions are in pixels, or in no stated unit and too fast for metres, or
+            head directions in no known unit.
     """
     which = ", ".join(f"{key} = {column}" for key, column in names.items())
     notes = [f"{name}: columns {which}"]
@@ -188,6 +193,8 @@ def as_raw(
     positions = np.column_stack(
         [table[key] * _metres(name, names[key], units.length) for key in "xy"]
     )
+    if units.length is None and not _unit_of(names["x"]):
+        _check_speed(name, times, positions)
     heading = None
     if "hd" in table:
         stated_angle = units.angle or _ANGLES.get(_unit_of(names["hd"]))
@@ -199,6 +206,21 @@ def as_raw(
 def _unit_of(field: str) -> str:
     match = _UNIT.match(field.lower())
     return match[2] if match else ""
+
+
+def _check_speed(name: str, times_s: np.ndarray, positions: np.ndarray) -> None:
+    """Refuse positions without a stated unit that would be too fast if they were in metres."""
+    steps_s = np.diff(times_s)
+    moved = np.hypot(*np.diff(positions, axis=0).T)
+    usable = np.isfinite(moved) & (steps_s > 0.0)
+    if usable.sum() < _ENOUGH:
+        return
+    speed = float(np.median(moved[usable] / steps_s[usable]))
+    if speed > FASTEST_M_S:
+        raise SourceError(
+            f"{name}: in metres, its median speed is {speed:.3g} m/s; expected at most "
+            f"{FASTEST_M_S:g} m/s; state the unit: --units cm, or m (in Python units='cm')"
+        )
 
 
 def _metres(name: str, field: str, given: float | None) -> float:

@@ -267,11 +267,14 @@ def test_why_names_the_checks_of_the_sequence(tmp_path, call):
     world, out = "world:ellipse?width=128&height=96&frames_per_lap=200&laps=1.4", tmp_path / "run"
     done = call("run", world, "--preset", "auto", "--no-tensorboard", "-o", out)
     assert done.code == 0
-    rows = csv.DictReader((out / "frames.csv").read_text().splitlines())
+    rows = list(csv.DictReader((out / "frames.csv").read_text().splitlines()))
     closed = next(r for r in rows if int(r["frame"]) > 190 and r["action"] == "link")
     found = why(out, int(closed["frame"]))
     assert found.closed
     assert [check.passed for check in found.checks] == [True] * 8
+    follows = next(r for r in rows[int(closed["frame"]) :] if r["action"] == "none")
+    later = why(out, int(follows["frame"]))
+    assert later.verdict.startswith("No loop to close: the robot is at experience ")
     before = why(out, 150)
     assert not before.closed
     assert before.verdict.startswith("No loop: stopped by 'evidence for experience")

@@ -515,7 +515,7 @@ def test_a_run_says_what_it_did_and_where(tmp_path, call):
     first, error, written = done.out.splitlines()
     assert re.fullmatch(r"6 frames at \d+ frames/s: .* templates, .*, 0 loop closures", first)
     assert "ATE (rigid): map " in error
-    assert written == f"Written: {out}"
+    assert written == f"Written: {out}; next: neuroslam report {out}"
 
 
 def test_an_old_name_of_a_key_is_read_and_told_in_one_line(tmp_path, call):

@@ -245,8 +245,8 @@ def test_spacings_follow_the_number_of_orientations(orientations_deg, spacings_m
         ),
         ({"orientations_deg": []}, "spacings_m has 1 modules, orientations_deg 0"),
         ({"spacings_m": []}, r"spacings_m = \[\]: tuple should have at least 1 item"),
-        ({"spacings_m": 0.3}, r"spacings_m = 0\.3: input should be a valid tuple"),
-        ({"spacings_m": "0.3"}, r"spacings_m = '0\.3': input should be a valid tuple"),
+        ({"spacings_m": 0.3}, r"spacings_m = 0\.3: expected a list in brackets"),
+        ({"spacings_m": "0.3"}, r"spacings_m = '0\.3': expected a list in brackets"),
         ({"spacings_m": [-0.3]}, r"spacings_m has -0\.3; expected more than 0"),
     ],
 )

@@ -200,7 +200,7 @@ def test_the_truth_and_its_walls_are_aligned_to_the_map_and_its_error_is_named()
     np.testing.assert_array_equal(segments(axes, style.LOOP)[0], SQUARE[[3, 0], :2])
     np.testing.assert_allclose(segments(axes, style.WALL)[0], SQUARE[:2, :2], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
-    aligned = labels["truth: ATE 0.0 cm, scaled by 0.5"]
+    aligned = labels["truth: ATE 0.0 cm, similarity 0.5"]
     np.testing.assert_allclose(aligned.get_xydata(), SQUARE[:, :2], atol=1e-9)
     robot = labels["robot now"]
     np.testing.assert_array_equal(robot.get_xydata()[0], here[:2])

@@ -239,7 +239,7 @@ def test_a_time_twice_is_told_as_it_is_and_costs_one_frame(bag, tmp_path, call):
     path = bag.write()
     stopped = call("run", path, "-o", tmp_path / "a", "--no-tensorboard")
     assert stopped.code == 2
-    assert "times must rise; or leave out such frames: --on-bad-frame skip" in stopped.err
+    assert "times must rise; to leave out such frames: --on-bad-frame skip" in stopped.err
     assert "damaged" not in stopped.err
     skipped = call("run", path, "-o", tmp_path / "b", "--no-tensorboard", "--on-bad-frame", "skip")
     assert skipped.code == 0
@@ -421,4 +421,4 @@ def test_the_case_of_doubled_odometry_says_what_is_doubled(case, tmp_path, call)
     assert stopped.err.startswith(
         f"neuroslam run: stopped early: {path}: /odom: frame 21: its time"
     )
-    assert stopped.err.endswith("times must rise; or leave out such frames: --on-bad-frame skip\n")
+    assert stopped.err.endswith("times must rise; to leave out such frames: --on-bad-frame skip\n")

@@ -292,7 +292,7 @@ def test_a_damaged_picture_stops_a_run_and_is_counted_if_skipped(tmp_path, call)
     path.write_bytes(data)
     done = call("run", path, "-o", tmp_path / "a", "--no-tensorboard")
     assert done.code == 2
-    assert "frame 9 is cut short; or leave out such frames: --on-bad-frame skip" in done.err
+    assert "frame 9 is cut short; to leave out such frames: --on-bad-frame skip" in done.err
     done = call("run", path, "-o", tmp_path / "b", "--no-tensorboard", "--on-bad-frame", "skip")
     assert done.code == 0
     assert f"skipped: {path}: frame 9 is cut short" in done.err

@@ -520,3 +520,22 @@ def test_reading_a_source_twice_gives_the_same_and_stop_cuts_it(tmp_path):
     assert [f.index for f in source.frames(1, 3)] == [1, 2]
     assert [f.index for f in source.frames(3, 99)] == [3, 4]
     assert list(source.frames(5)) == []
+
+
+def test_a_table_of_positions_is_the_track_of_an_animal(tmp_path):
+    path = tmp_path / "rat.csv"
+    path.write_text("time_ms,x_cm,y_cm\n0,0,0\n500,10,0\n1000,10,20\n")
+    positions = open_source(path).walk.positions
+    np.testing.assert_allclose(positions, [[0.0, 0.0], [0.1, 0.0], [0.1, 0.2]])
+
+
+def test_a_misspelt_path_and_the_folder_of_a_run_are_refused_with_what_to_do(tmp_path):
+    (tmp_path / "drive.mp4").touch()
+    assert "drvie.mp4: no such file or folder; did you mean 'drive.mp4'?" in refused(
+        tmp_path / "drvie.mp4"
+    )
+    for name in ("brain.safetensors", "config.toml", "map.png"):
+        (tmp_path / name).touch()
+    said = refused(tmp_path)
+    assert "is the folder of a run, not a recording; expected what it was made from" in said
+    assert said.endswith(f"neuroslam resume {tmp_path}")

@@ -131,7 +131,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path, csv_file):
     with pytest.raises(ConfigError, match="has no column 'foo'"):
         read_animal_track(csv_file, columns={"t": "foo"})
     with pytest.raises(SourceError, match="outside the arena"):
-        read_animal_track(csv_file, columns=COLUMNS, arena=SQUARE)  # cm taken for m
+        read_animal_track(csv_file, columns=COLUMNS, units="m", arena=SQUARE)  # cm taken for m
     with pytest.raises(SourceError, match="unknown option 'unit'"):
         open_source(f"track:{csv_file}?unit=cm")
     line = np.column_stack([np.arange(5.0), np.zeros(5)])
@@ -181,7 +181,7 @@ def test_columns_may_differ_in_their_units(tmp_path):
 
 def test_times_in_milliseconds_at_200_hz_are_no_seconds(tmp_path):
     for header in ("time_ms,x,y", "t,x,y"):
-        walk = read_animal_track(table(tmp_path / "r.csv", header, tick=5.0), arena=None)
+        walk = read_animal_track(table(tmp_path / "r.csv", header, tick=5.0), units="m", arena=None)
         assert walk.times_s[-1] == pytest.approx(0.195)
     np.savez(tmp_path / "r.npz", pos=PATH, t=5.0 * np.arange(N))
     assert any(
@@ -363,3 +363,12 @@ def test_an_nwb_file_that_names_other_data_or_fills_memory_is_one_line(nwb, tmp_
     path.write_bytes(nwb().read_bytes()[:3000])
     with pytest.raises(SourceError, match="is no readable NWB file"):
         read_animal_track(path)
+
+
+def test_positions_without_a_unit_that_would_be_too_fast_in_metres_are_refused(tmp_path):
+    path = tmp_path / "rat.csv"
+    path.write_text("time,x,y\n" + "".join(f"{k / 20},{k},{k % 3}\n" for k in range(50)))
+    with pytest.raises(SourceError, match=r"median speed is .* m/s; expected at most 2 m/s"):
+        read_animal_track(path, arena=None)
+    assert read_animal_track(path, units="cm", arena=None).positions[10].tolist() == [0.1, 0.01]
+    assert read_animal_track(path, units="m", arena=None).positions[10].tolist() == [10.0, 1.0]
