@@ -154,6 +154,11 @@ def _key(brain: NavigationBrain, experience: int) -> tuple[int, int]:
     return int(table["session"][experience]), int(table["number"][experience])
 
 
+def _tracks(brain: NavigationBrain) -> bool:
+    """Return whether the robot is at known places, by sequences of views."""
+    return brain.tracker is not None and brain.tracker.tracks
+
+
 def _visit(brain: NavigationBrain, visited: dict[tuple[int, int], float]) -> None:
     if brain.map.current != NO_EXPERIENCE:
         visited[_key(brain, brain.map.current)] = brain.clock.time_s
@@ -178,6 +183,7 @@ def _explain(brain: NavigationBrain, frame: Frame, visited: dict[tuple[int, int]
     candidate = NO_TEMPLATE if view is None or not len(ids) else int(ids[errors[ids].argmin()])
     stored_template = None if candidate == NO_TEMPLATE else brain.view.stored_view(candidate)
     refusals = len(brain.sessions.refusals)
+    tracked = _tracks(brain)
     result = brain(frame)
     joined = len(brain.sessions.merges) > merges
 
@@ -196,14 +202,14 @@ def _explain(brain: NavigationBrain, frame: Frame, visited: dict[tuple[int, int]
     checks = _checks(brain, contrast, errors, len(ids), candidate, experience, square, result)
     if joined:
         verdict = "A stored map was recognised and joined at this frame."
-    elif closed:
-        verdict = f"A loop was closed to experience {reached}: every check passed."
-    elif result.action == "none" and brain.tracker is not None and brain.tracker.tracks:
+    elif tracked and _tracks(brain) and not all(check.passed for check in checks):
         made = int(brain.map.experiences["first_frame"][reached])
         verdict = (
-            f"No loop to close: the robot is at experience {reached} already, made at frame "
-            f"{made}. The checks are those of a jump to another part of the map."
+            f"No loop to close: the robot follows the map and is at experience {reached}, made at "
+            f"frame {made}. The checks are those of a jump to another part of the map."
         )
+    elif closed:
+        verdict = f"A loop was closed to experience {reached}: every check passed."
     else:
         verdict = _verdict(checks, result)
     stored = brain.not_joined()
@@ -282,16 +288,16 @@ def _checks(
 
 def _checks_of_tracker(seen: Seen, limits: SequenceConfig) -> list[Check]:
     """List the checks of a loop closure by a sequence of views, as the tracker made them."""
-    above, least = "standard deviations more than", "at least"
+    above, least = "above", "at least"
     lead = seen.evidence - seen.rival
     none = seen.candidate == NO_EXPERIENCE
     candidate = "an experience" if none else f"experience {seen.candidate}"
     rows: list[tuple[str, float, float, bool, str]] = [
         ("experiences compared", seen.compared, limits.min_experiences,
          seen.compared >= limits.min_experiences, least),
-        (f"evidence for {candidate}", seen.evidence, limits.believe,
+        (f"evidence for {candidate}, standard deviations", seen.evidence, limits.believe,
          seen.evidence > limits.believe, above),
-        ("its lead over any other part of the map", lead, limits.margin,
+        ("its lead over any other part of the map, standard deviations", lead, limits.margin,
          lead > limits.margin, above),
         ("frames in a row that agree", seen.streak, limits.confirm_frames,
          seen.streak >= limits.confirm_frames, least),
