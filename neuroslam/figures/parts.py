@@ -69,9 +69,9 @@ def _align_truth(track: np.ndarray, truth: np.ndarray | None, walls: np.ndarray 
         mode = "none"
         alignment = align(seen, true, mode)
     ate = absolute_trajectory_error(seen, true, mode).rmse
-    how = f"similarity {1.0 / alignment.scale:.3g}" if mode == "similarity" else "not aligned"
+    how = mode if mode == "similarity" else "not aligned"
     walls_on_map = alignment.undo(segments.reshape(-1, 2)).reshape(-1, 2, 2)
-    return _Truth(alignment.undo(truth), walls_on_map, f"truth: ATE {_metres(ate)}, {how}")
+    return _Truth(alignment.undo(truth), walls_on_map, f"truth: ATE {_metres(ate)} ({how})")
 
 
 def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "", unit: str = "m") -> None:

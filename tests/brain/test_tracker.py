@@ -274,7 +274,9 @@ def test_why_names_the_checks_of_the_sequence(tmp_path, call):
     assert [check.passed for check in found.checks] == [True] * 8
     follows = next(r for r in rows[int(closed["frame"]) :] if r["action"] == "none")
     later = why(out, int(follows["frame"]))
-    assert later.verdict.startswith("No loop to close: the robot follows the map and is at experience ")
+    assert later.verdict.startswith(
+        "No loop to close: the robot follows the map and is at experience "
+    )
     before = why(out, 150)
     assert not before.closed
     assert before.verdict.startswith("No loop: stopped by 'evidence for experience")

@@ -200,7 +200,7 @@ def test_the_truth_and_its_walls_are_aligned_to_the_map_and_its_error_is_named()
     np.testing.assert_array_equal(segments(axes, style.LOOP)[0], SQUARE[[3, 0], :2])
     np.testing.assert_allclose(segments(axes, style.WALL)[0], SQUARE[:2, :2], atol=1e-9)
     labels = {line.get_label(): line for line in axes.get_lines()}
-    aligned = labels["truth: ATE 0.0 cm, similarity 0.5"]
+    aligned = labels["truth: ATE 0.0 cm (similarity)"]
     np.testing.assert_allclose(aligned.get_xydata(), SQUARE[:, :2], atol=1e-9)
     robot = labels["robot now"]
     np.testing.assert_array_equal(robot.get_xydata()[0], here[:2])
@@ -248,7 +248,7 @@ def test_a_truth_that_does_not_fit_the_track_is_refused():
 def test_a_robot_at_rest_is_drawn_at_its_position():
     figure = maps.plot_map(SQUARE[:1], np.empty((0, 2)), truth_xy=[[0.0, 3.0]])
     labels = [line.get_label() for line in figure.get_axes()[0].get_lines()]
-    assert "truth: ATE 3.00 m, not aligned" in labels
+    assert "truth: ATE 3.00 m (not aligned)" in labels
 
 
 def test_a_map_without_experiences_is_labelled_and_shows_no_robot():
