@@ -226,10 +226,11 @@ plt.show()
 
 # %%
 before = robot.placed
-moving = LiveRobot(journal, brains["eve"])
+eve = brains["eve"]
+moving = LiveRobot(journal, eve)
 moving.take()
 for frame in open_source(SOURCES["eve"].replace("laps=0.5", "laps=0.62")).frames(start=101):
-    brains["eve"](frame)
+    eve(frame)
 receipts = moving.offer()
 robot.take()
 new = robot.placed - before

@@ -274,4 +274,4 @@ def entropy_bits(belief: np.ndarray, unknown: float) -> float:
         1.5
     """
     some = np.append(belief[belief > LEAST], max(unknown, LEAST))
-    return float(-(some * np.log2(some)).sum())
+    return abs(float((some * np.log2(some)).sum()))

@@ -65,9 +65,9 @@ def test_two_saves_of_one_brain_are_equal_files(brain, saved, tmp_path):
     assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
 
 
-@pytest.mark.parametrize("stop", [1, 17, 120, 345])
+@pytest.mark.parametrize("stop", [1, 345])
 def test_going_on_in_a_new_process_is_bit_equal_to_never_having_stopped(stop, tmp_path):
-    """Before a first loop, in the middle, and after loop closures (a lap has 340 frames)."""
+    """Before a first loop, and after loop closures (a lap has 340 frames)."""
     end = stop + 15
     save_brain(lived(stop), tmp_path / "cut.safetensors")
     save_brain(lived(end), tmp_path / "whole.safetensors")
