@@ -64,12 +64,13 @@ def rows() -> list[Row]:
         target = "<= 500 ms" if n == TARGET else "linear"
         found.append(Row("merge of two maps", f"{n} places each", ms, target))
     rng = np.random.default_rng(3)
-    maps = [mapped(2_500, seed).view for seed in range(8)]
+    brains = [mapped(2_500, seed) for seed in range(8)]
+    views, maps = [one.view for one in brains], [one.map for one in brains]
     view = rng.integers(0, 256, (10, 60)) / 255.0
     for k in (1, 2, 4, 8):
-        joined = StoredViews(maps[:k])
+        joined = StoredViews(views[:k], maps[:k])
         once = cpu_ms(lambda joined=joined: joined.search(view), 20)
-        each = cpu_ms(lambda k=k: [one.search(view, 0.05) for one in maps[:k]], 20)
+        each = cpu_ms(lambda k=k: [one.search(view, 0.05) for one in views[:k]], 20)
         size = f"{k} stored maps of 2500 places"
         found.append(Row("a view among stored maps", size, once, "", f"one by one {written(each)}"))
     return found
