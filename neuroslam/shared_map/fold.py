@@ -42,6 +42,7 @@ from neuroslam.view.search import template_blocks
 LAYOUT = np.dtype(
     [("session", "<u8"), ("number", "<u4"), ("experience", "<u4"), ("pose", "<f4", 3)]
 )
+"""Record of a place on the shared map: of which session and number, experience, and pose."""
 
 LEAST_PLACES = 3
 """Places from which a piece is tried: fewer cannot be confirmed."""

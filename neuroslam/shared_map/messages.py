@@ -63,6 +63,7 @@ PLACE = np.dtype(
         ("cell", "<f4", 3),
     ]
 )
+"""Record of a new experience in an offer."""
 LINK = np.dtype(
     [
         ("source_session", "<u2"),
@@ -75,6 +76,7 @@ LINK = np.dtype(
         ("duration_s", "<f4"),
     ]
 )
+"""Record of a link in an offer."""
 
 
 class Offer(NamedTuple):
