@@ -30,7 +30,7 @@ _ROWS = {"frames.csv": FRAME_COLUMNS + "\n", "trace.f64": ""}
 def join_brains(*brains: NavigationBrain) -> tuple[NavigationBrain | None, list[MergeReport]]:
     """Match and merge finished maps, then the stored maps of any.
 
-    Of a drive with several maps the largest is matched, :attr:`.NavigationBrain.largest`. All pairs
+    Of a drive with several maps the largest is matched, ``NavigationBrain.largest``. All pairs
     are matched; of those that meet, the one with most matched experiences is merged first, then
     the pairs with the merged map are matched again. If the last drive ended on another map than
     its largest one, that map joins the merged one, or stays the present one beside it.
