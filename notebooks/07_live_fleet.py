@@ -191,7 +191,7 @@ plt.legend()
 plt.show()
 
 # %% [markdown]
-# ## What others found
+# ## Places of other robots
 # Once a fold is published, every robot can take it: `take` reads what is new, `recognise` compares a picture with all
 # places, `pose` is the robot's own pose on the shared map.
 

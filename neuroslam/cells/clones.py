@@ -357,7 +357,7 @@ class CloneCells(Population):
         at = map_.pose_table[map_.current, :2]
         return math.dist(map_.pose[:2], at) / self.place_m
 
-    # ------------------------------------------------------------------- what others ask
+    # ------------------------------------------------------------------- questions of other parts
 
     @property
     def rates(self) -> np.ndarray:

@@ -29,7 +29,7 @@ RING = "world:ellipse?noise=0.01&width=128&height=32&frames_per_lap=200"
 """World of the processes: small pictures, so that two cores have many robots."""
 
 POLL_S = 0.25
-"""Pause between two looks of a robot at what others offered."""
+"""Pause between two looks of a robot at the offers of others."""
 
 
 def _started(target: Any, arguments: list[tuple[Any, ...]]) -> list[BaseProcess]:  # noqa: ANN401

@@ -178,7 +178,7 @@ class LiveRobot:
             ((ids[row[0]], row[2]), (ids[row[1]], row[3])) for row in offer.links.tolist()
         )
 
-    # --- what others found ----------------------------------------------------------------------
+    # --- the places of other robots ------------------------------------------------------------
 
     def take(self) -> int:
         """Take what came since the last call; return the number of places usable now.

@@ -340,7 +340,7 @@ class Population(Mergeable):
         """Whether its senses contradict what it knows of the place."""
         return False
 
-    # --- what others ask -----------------------------------------------------------------------
+    # --- questions of other parts ----------------------------------------------------------------
 
     @property
     def rates(self) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from neuroslam.shared_map import Journal, LiveRobot
 
 
 def drive(folder: Path, brain: NavigationBrain, picture: np.ndarray) -> None:
-    """Offer what is new, take what others found, and ask where a picture was taken."""
+    """Offer what is new, take the places of other robots, and ask where a picture was taken."""
     with Journal(folder, brain.config) as journal:
         robot = LiveRobot(journal, brain, "ada")
         robot.offer()
