@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import gc
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,9 @@ from neuroslam.cli import main, progress
 # Imports and collected tests make a million objects, none of them garbage: Python searches them for
 # reference cycles again and again, in a tenth of the time of all tests.
 gc.disable()
+
+# Of the hundreds of programs that tests start, the first compiles neuroslam to bytecode, not each.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 torch.set_num_threads(1)
 cv2.setNumThreads(1)

@@ -16,6 +16,7 @@ from neuroslam.errors import RunError, counted
 from neuroslam.figures.maps import plot_activity, plot_map, plot_pose_cells, plot_signals
 from neuroslam.figures.places import plot_place_cells
 from neuroslam.figures.style import plain_text, readable_source, save, shortened
+from neuroslam.geometry import move_points
 from neuroslam.runs.cells import activity_of, draw_cells
 from neuroslam.runs.files import RunPlan, brain_file
 from neuroslam.runs.reading import (
@@ -29,7 +30,7 @@ from neuroslam.runs.reading import (
     true_poses,
 )
 from neuroslam.state.answers import pictures_of
-from neuroslam.types import PoseEstimate
+from neuroslam.types import Pose, PoseEstimate
 
 _TITLE_WIDTH = 90  # characters
 
@@ -51,7 +52,8 @@ def plot(out: str | Path, to: str | Path) -> list[Path]:
         to.mkdir(parents=True, exist_ok=True)
         draw_map(brain, plan, trace, to / "map.png", length_unit(out))
         brain = brain.largest
-        path = trajectory(brain, trace)[:, :2]
+        path = trajectory(brain, trace)
+        path = path[np.isfinite(path[:, 0])]
         figures: dict[str, Figure] = {}
         for kind, population in brain.populations.items():
             if kind in _DRAWN:
@@ -85,7 +87,9 @@ def _draw_pose_cells(cells: PoseCellNetwork, _path: np.ndarray) -> dict[str, Fig
 
 
 def _draw_place_cells(cells: NavigationCells, path: np.ndarray) -> dict[str, Figure]:
-    return {"place_cells.png": plot_place_cells(*cells.remembered(), cells.pose, path)}
+    """Draw the path where the cells are: the map has coordinates of its own."""
+    track = move_points(path[:, :2], Pose(*path[-1]), cells.pose) if len(path) else path[:, :2]
+    return {"place_cells.png": plot_place_cells(*cells.remembered(), cells.pose, track)}
 
 
 _DRAWN: dict[str, Callable[[Any, np.ndarray], dict[str, Figure]]] = {

@@ -19,6 +19,7 @@ from neuroslam.brain import load_brain
 from neuroslam.config import BrainConfig, build_config, read_preset
 from neuroslam.errors import RunError
 from neuroslam.evaluation.trajectory import read_tum
+from neuroslam.figures.places import plot_place_cells
 from neuroslam.runs.evaluate import evaluate
 from neuroslam.runs.files import TRACE_COLUMNS
 from neuroslam.runs.plot import plot
@@ -405,6 +406,24 @@ def test_plot_draws_the_cells_that_the_brain_has(cells, figures, tmp_path):
     quiet_run(f"{WORLD}&ranges=36&markers=6", tmp_path / "run", BrainConfig(cells=cells), stop=8)
     written = plot(tmp_path / "run", tmp_path / "figures")
     assert [path.name for path in written] == ["map.png", *figures, "signals.png"]
+
+
+def test_the_path_is_drawn_where_the_place_cells_are(tmp_path, monkeypatch):
+    """The pose cells lead, and their map has its own coordinates."""
+    config = build_config(read_preset("full") | {"cells": ["pose", "place"]})
+    quiet_run("arena:square?minutes=0.5", tmp_path / "run", config)
+    drawn = []
+    monkeypatch.setattr(
+        "neuroslam.runs.plot.plot_place_cells",
+        lambda *what: drawn.append(what) or plot_place_cells(*what),
+    )
+    plot(tmp_path / "run", tmp_path / "figures")
+    ((centres, _, _, here, path),) = drawn
+    assert len(centres) > 2
+    np.testing.assert_allclose(path[-1], here[:2], atol=1e-9)
+    np.testing.assert_allclose(path[0], centres[0], atol=0.1)
+    apart = np.linalg.norm(path[:, None] - centres, axis=-1).min(axis=0)
+    assert apart.max() < 0.1
 
 
 def test_overwriting_leaves_nothing_of_the_run_before(whole, tmp_path):
