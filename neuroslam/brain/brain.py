@@ -10,6 +10,7 @@ import torch
 from neuroslam.brain.forgetting import forget
 from neuroslam.brain.state import BrainState
 from neuroslam.errors import BadFrame, SourceError, first_line
+from neuroslam.odometry.climb import Outlook
 from neuroslam.odometry.flow import FlowOdometry, Picture, Reckoned
 from neuroslam.odometry.visual import Profiles
 from neuroslam.sensors.frames import (
@@ -48,6 +49,8 @@ class Accepted(NamedTuple):
         dt_s: Time since the last frame.
         profiles: What the visual odometry of the next frame needs; ``None``: not used.
         gap: The time since the last frame exceeds ``max_gap_s``: a new map begins.
+        v_z_m_s: Speed upwards, measured or seen.
+        outlook: What the next image needs to see it; ``None``: it is not seen.
     """
 
     frame: Frame
@@ -57,6 +60,8 @@ class Accepted(NamedTuple):
     dt_s: float
     profiles: Profiles | Picture | Reckoned | None
     gap: bool
+    v_z_m_s: float = 0.0
+    outlook: Outlook | None = None
 
 
 class NavigationBrain(BrainState):
@@ -177,12 +182,13 @@ class NavigationBrain(BrainState):
             if self._makes_views and frame.image is not None:
                 view = self.view.usable_view(frame.image)
             velocity, profiles = self._velocity(frame, dt_s)
+            v_z_m_s, outlook = self._speed_upwards(frame, velocity, dt_s)
             gap = dt_s > self.config.max_gap_s
             if not gap and self._with["check"]:  # after a gap a new map begins
                 self._check(frame, observed, Motion(*velocity, dt_s))
         except BadFrame as fault:
             raise BadFrame(f"frame {frame.index}: {fault}") from None
-        return Accepted(frame, view, observed, velocity, dt_s, profiles, gap)
+        return Accepted(frame, view, observed, velocity, dt_s, profiles, gap, v_z_m_s, outlook)
 
     def _check(self, frame: Frame, observed: dict[str, Any], motion: Motion) -> None:
         now, leader = StepInput(frame.index, motion, BLIND, frame.heading_rad), self.leader
@@ -195,7 +201,7 @@ class NavigationBrain(BrainState):
         frame, view, velocity, dt_s = accepted[0], accepted.view, accepted.velocity, accepted.dt_s
         if accepted.profiles is not None:
             self.odometry.remember(accepted.profiles)  # type: ignore[arg-type]
-        gap, climb = accepted.gap, 0.0 if frame.v_z_m_s is None else float(frame.v_z_m_s)
+        gap, climb, outlook = accepted.gap, accepted.v_z_m_s, accepted.outlook
         change, broken = (0.0, False) if view is None else self.continuity.compare(view)
         alarm = broken and self._detects
         if gap or alarm:
@@ -203,8 +209,10 @@ class NavigationBrain(BrainState):
                 self.start_new_map("gap" if gap else "kidnapped")
             if gap or accepted.profiles is not None:
                 velocity = Velocity(0.0, 0.0)  # images of two places do not measure motion
-            climb = 0.0 if gap else climb
+            climb = 0.0 if gap or outlook is not None else climb
             dt_s = 1.0 / self.config.frame_rate_hz if gap else dt_s
+        if self.climb is not None:
+            self.climb.remember(outlook, accepted.dt_s, broken=gap or alarm)
         self.continuity.moved(velocity, dt_s)
         match, tracking = BLIND, None
         if view is not None and self.tracker is None:
@@ -379,6 +387,15 @@ class NavigationBrain(BrainState):
                 "'new_map', if the gap is real"
             )
         return float(dt_s)
+
+    def _speed_upwards(
+        self, frame: Frame, velocity: Velocity, dt_s: float
+    ) -> tuple[float, Outlook | None]:
+        if self.climb is None:
+            return (0.0 if frame.v_z_m_s is None else float(frame.v_z_m_s)), None
+        if frame.image is None:
+            return self.climb.reckon(velocity.v_m_s), None
+        return self.climb.measure(frame.image, dt_s, *velocity)
 
     def _velocity(
         self, frame: Frame, dt_s: float

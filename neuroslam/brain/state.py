@@ -28,6 +28,7 @@ from neuroslam.merging.match import shared_history
 from neuroslam.merging.merge import merge
 from neuroslam.merging.report import MergeReport
 from neuroslam.odometry import FlowOdometry, VisualOdometry, visual_odometry
+from neuroslam.odometry.climb import VisualClimb
 from neuroslam.state.answers import check_names
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import AboutNow, Mergeable, ModulesOf, QuickModule, State
@@ -78,6 +79,7 @@ class BrainState(QuickModule):
     half_taken: str
     clock: Clock
     odometry: VisualOdometry | FlowOdometry
+    climb: VisualClimb | None
     view: LocalViewCells
     map: ExperienceMap
     # Populations of the package, if config.cells names them:
@@ -161,6 +163,8 @@ class BrainState(QuickModule):
         """Start with an empty map."""
         config, cells = self.config, self.config.pose_cells
         self.odometry = visual_odometry(config.odometry, config.view.grey)
+        seen = config.odometry.climb != "given"
+        self.climb = VisualClimb(config.odometry, config.view.grey) if seen else None
         self.view = LocalViewCells(config.view, self._encoder)
         self.map = ExperienceMap(
             config.map, (cells.n_xy, cells.n_xy, cells.n_theta), cells.create_threshold_cells
@@ -318,7 +322,8 @@ class BrainState(QuickModule):
             return
         before, tally = self.sessions.now, self.recognition.tally
         # Kept: they compare successive frames.
-        senses, sequence = (self.odometry, self.continuity), self.recognition.sequence
+        senses = self.odometry, self.climb, self.continuity
+        sequence = self.recognition.sequence
         kept = type(self)(self.config)
         kept.restore({k: v for k, v in self.state_dict().items() if k[:7] != "stored."}, [])
         self.stored.append(kept)
@@ -326,7 +331,7 @@ class BrainState(QuickModule):
         self._begin()
         for kind, population in self._populations.items():
             population.continue_from(populations[kind])
-        self.odometry, self.continuity = senses
+        self.odometry, self.climb, self.continuity = senses
         self.recognition.sequence = sequence
         for alike, agreed in zip(tally["alike"].tolist(), tally["agreed"].tolist(), strict=True):
             self.recognition.tally.append(alike=alike, agreed=agreed)

@@ -56,6 +56,31 @@ class OdometryConfig(Section):
         description="flow: tilt of the camera downwards from the horizontal, in degrees; larger: "
         "the same flow of the floor is a lower speed",
     )
+    climb: Literal["given", "pitch", "slope"] = Field(
+        default="given",
+        description="source of the speed upwards; given: the source's own; pitch: images of a "
+        "camera that pitches with its vehicle on ramps; slope: images of a camera that stays level "
+        "on its way up, as a drone's. method says how images are compared",
+    )
+    level_deg: float = Field(
+        default=3.0,
+        ge=0,
+        lt=45,
+        description="climb = pitch: pitch below which the ground counts as level, in degrees; "
+        "larger: less drift of height, gentler ramps are overlooked",
+    )
+    level_s: float = Field(
+        default=2.0,
+        gt=0,
+        description="climb = pitch: time in which a pitch below level_deg decays to a third; "
+        "larger: errors of the pitch last longer, the foot of a ramp is measured better",
+    )
+    view_distance_m: float = Field(
+        default=5.0,
+        gt=0,
+        description="climb = slope, method = profiles: distance of what the middle of the image "
+        "shows, in m; larger: the same shift of rows is a higher speed upwards",
+    )
     given_speed_error: float = Field(
         default=0.05,
         gt=0,
@@ -125,6 +150,15 @@ class OdometryConfig(Section):
     def _check_method(self) -> Self:
         if self.use == "fused" and self.method != "flow":
             raise ValueError("use = 'fused' needs method = 'flow': profiles have no variance")
+        if self.climb == "pitch" and self.method != "flow":
+            raise ValueError(
+                "climb = 'pitch' needs method = 'flow': the profile of the rows moves by the speed too"
+            )
+        if self.climb != "given" and self.fov_deg > 150.0:
+            raise ValueError(
+                f"climb = '{self.climb}' with fov_deg = {self.fov_deg:g}; expected at most 150: a "
+                "panoramic image is no plane"
+            )
         return self
 
 

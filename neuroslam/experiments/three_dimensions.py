@@ -29,8 +29,17 @@ from neuroslam.types import Frame, Motion, Velocity
 from neuroslam.worlds.storeys import STOREY_M
 from neuroslam.worlds.world import WorldSource, open_world
 
-METHODS: dict[str, dict[str, Any]] = {"pose_3d": {}, "pose": {"cells": ["pose"]}}
-"""Population that leads -> differences from the preset ``neuroslam_3d``."""
+METHODS: dict[str, dict[str, Any]] = {
+    "given": {},
+    "seen": {"odometry": {"method": "flow"}},
+    "rows": {"odometry": {"method": "profiles"}},
+    "plane": {"cells": ["pose"]},
+}
+"""How the height is measured -> differences from the preset ``neuroslam_3d``: the speed upwards of
+the source, that of the images by corners and by the profile of their rows, and no height."""
+
+CLIMBS = {"garage": "pitch", "atrium": "slope"}
+"""What a camera shows of the height: a car's pitches on ramps, a drone's stays level."""
 
 _DT_S = 0.2
 
@@ -68,6 +77,8 @@ def three_dimensions(
 ) -> dict[str, Any]:
     """Drive through three storeys that look alike; count the drives that confuse them.
 
+    Every drive is mapped with the height given, seen and ignored.
+
     Args:
         _data_folder: Not used.
         out_folder: ``results.json`` and ``three_dimensions.png`` are written there.
@@ -91,13 +102,13 @@ def three_dimensions(
                 images = _images(open_world(spec))
                 for seed in seeds:
                     source = open_world(f"{spec}&noise={noise:g}&seed={seed}")
-                    for method in METHODS:
-                        one = _drive(method, source, images)
+                    for method in methods_of(world):
+                        one = _drive(method, world, source, images)
                         found.setdefault((world, method), []).append(one)
-        cells_us = {name: _cells_us(name) for name in METHODS}
-    rows = [_row(*key, each, cells_us[key[1]]) for key, each in found.items()]
+        cells_us = {name: _cells_us(name) for name in ("given", "plane")}
+    rows = [_row(*key, each, cells_us.get(key[1])) for key, each in found.items()]
     results = {"rows": rows, "noise": noise, "looks": list(looks)}
-    save(_plot(found, cells_us), Path(out_folder) / "three_dimensions.png")
+    save(_plot(found), Path(out_folder) / "three_dimensions.png")
     write_results(Path(out_folder), results)
     return results
 
@@ -113,26 +124,36 @@ def _frames(source: WorldSource, images: Sequence[np.ndarray]) -> Iterator[Frame
         yield Frame(i, i * _DT_S, image, Velocity(velocity[0], velocity[1]), v_z_m_s=climb)
 
 
-def config_of(method: str) -> BrainConfig:
+def methods_of(world: str) -> list[str]:
+    """Return the methods of a world: the profile of rows does not show a car's pitch."""
+    return [name for name in METHODS if name != "rows" or CLIMBS[world] == "slope"]
+
+
+def config_of(method: str, world: str = "garage") -> BrainConfig:
     """Return the config of a method of :data:`METHODS`."""
-    return build_config(merge_values(read_preset("neuroslam_3d"), METHODS[method]), method)
+    values = merge_values(read_preset("neuroslam_3d"), METHODS[method])
+    if method in ("seen", "rows"):
+        values = merge_values(values, {"odometry": {"climb": CLIMBS[world]}})
+    return build_config(values, method)
 
 
-def _drive(method: str, source: WorldSource, images: Sequence[np.ndarray]) -> Drive:
+def _drive(method: str, world: str, source: WorldSource, images: Sequence[np.ndarray]) -> Drive:
     """Let a new brain take all frames of a drive."""
-    brain = NavigationBrain(config_of(method))
-    at, offsets, above = [], [], []
+    brain = NavigationBrain(config_of(method, world))
+    at, offsets, above, climbs = [], [], [], []
     frames, began = list(_frames(source, images)), time.process_time()
     for frame in frames:
         at.append(brain(frame).experience)
         offsets.append(brain.map.offset)
-        above.append(_cells_3d(brain).now.rise_m if method == "pose_3d" else 0.0)
+        above.append(_cells_3d(brain).now.rise_m if method != "plane" else 0.0)
+        seen, v_m_s = brain.climb, cast(Velocity, frame.velocity).v_m_s
+        climbs.append(frame.v_z_m_s if seen is None else seen.reckon(v_m_s))
     frame_ms = 1e3 * (time.process_time() - began) / len(frames)
     brain.map.solve()
     on_map, height = np.array(at), source.heights()
     poses = compose_poses(brain.map.poses[on_map], np.array(offsets))
     z = np.array(above)
-    if method == "pose_3d":
+    if method != "plane":
         z += _cells_3d(brain).experience_heights_m[on_map]
     first, links = brain.map.experiences["first_frame"].numpy(), brain.map.links
     made_at = height[first]
@@ -142,7 +163,7 @@ def _drive(method: str, source: WorldSource, images: Sequence[np.ndarray]) -> Dr
     alone = integrate_velocities(speed, turn, np.full(len(at), _DT_S), source.truth(0))
     return Drive(
         truth=np.column_stack([truth[:, :2], height]),
-        odometry=np.column_stack([alone[:, :2], np.cumsum(source.climbs()) * _DT_S]),
+        odometry=np.column_stack([alone[:, :2], np.cumsum(climbs) * _DT_S]),
         track=np.column_stack([poses[:, :2], z]),
         confused=on_another_storey(on_map, first, height, STOREY_M),
         wrong_links=int(wrong.sum()),
@@ -158,10 +179,11 @@ def _cells_3d(brain: NavigationBrain) -> PoseCells3D:
 def _cells_us(method: str, n: int = 2000) -> float:
     """Return the CPU time of a step of the cells alone, in microseconds."""
     config = config_of(method)
+    in_3d = method != "plane"
     cells: PoseCells3D | PoseCellNetwork = PoseCellNetwork(config.pose_cells)
-    if method == "pose_3d":
+    if in_3d:
         cells = PoseCells3D(config.pose_cells, cast(Pose3DConfig, config.section("pose_3d")))
-    more = (0.2,) if method == "pose_3d" else ()
+    more = (0.2,) if in_3d else ()
     motion = Motion(2.5, 0.3, _DT_S)
     for _ in range(100):
         cells.integrate(motion, *more)
@@ -171,15 +193,18 @@ def _cells_us(method: str, n: int = 2000) -> float:
     return 1e6 * (time.process_time() - began) / n
 
 
-def _row(world: str, method: str, drives: Sequence[Drive], cells_us: float) -> dict[str, Any]:
+def _row(
+    world: str, method: str, drives: Sequence[Drive], cells_us: float | None
+) -> dict[str, Any]:
     errors, alone = (
         np.array([_rms(error_in_3d(track, d.truth)) for d, track in pairs])
         for pairs in ([(d, d.track) for d in drives], [(d, d.odometry) for d in drives])
     )
+    height = np.array([_rms(_height_errors(d)) for d in drives])
     flat = np.array([_rms(error_in_3d(_flat(d.track), _flat(d.truth))) for d in drives])
     return {
         "world": world,
-        "cells": method,
+        "height": method,
         "drives": len(drives),
         "drives_confused": sum(bool(d.confused.any()) for d in drives),
         "frames_confused_share": float(np.mean([d.confused.mean() for d in drives])),
@@ -187,12 +212,18 @@ def _row(world: str, method: str, drives: Sequence[Drive], cells_us: float) -> d
         "loop_closures_median": float(np.median([d.loops for d in drives])),
         "ate_3d_median_m": float(np.median(errors)),
         "ate_3d_max_m": float(errors.max()),
+        "height_rmse_median_m": float(np.median(height)),
         "ate_plane_median_m": float(np.median(flat)),
         "odometry_ate_3d_median_m": float(np.median(alone)),
         "worse_than_odometry": int((errors > alone).sum()),
         "brain_ms_a_frame": float(np.median([d.frame_ms for d in drives])),
         "cells_us_a_step": cells_us,
     }
+
+
+def _height_errors(drive: Drive) -> np.ndarray:
+    apart = drive.track[:, 2] - drive.truth[:, 2]
+    return np.asarray(apart - apart.mean())
 
 
 def _rms(errors: np.ndarray) -> float:
@@ -209,16 +240,15 @@ def _aligned(track: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.column_stack([track[:, :2] @ found.rotation.T + found.translation, up])
 
 
-def _plot(
-    found: Mapping[tuple[str, str], Sequence[Drive]], cells_us: Mapping[str, float]
-) -> Figure:
-    drive, flat = found["garage", "pose_3d"][0], found["garage", "pose"][0]
+def _plot(found: Mapping[tuple[str, str], Sequence[Drive]]) -> Figure:
+    seen, flat = found["garage", "seen"][0], found["garage", "plane"][0]
+    drive = seen
     with mpl.rc_context(STYLE):
         figure = new_figure(11.0, 7.6, "A garage of three storeys that look alike")
         tracks = (
             ("truth", drive.truth, TRUTH),
-            ("odometry alone", _aligned(drive.odometry, drive.truth), ODOMETRY),
-            ("map, pose cells in 3-D", _aligned(drive.track, drive.truth), MAP),
+            ("odometry alone, height seen", _aligned(drive.odometry, drive.truth), ODOMETRY),
+            ("map, height seen", _aligned(drive.track, drive.truth), MAP),
         )
         grid = figure.add_gridspec(2, 3, height_ratios=(1.25, 1.0))
         for column, (name, points, colour) in enumerate(tracks):
@@ -232,24 +262,25 @@ def _plot(
             error = _rms(error_in_3d(points, drive.truth))
             axes.set_title(name if name == "truth" else f"{name}: ATE {error:.2f} m", y=0.97)
         figure.add_subplot(grid[1, :2])
-        _plot_heights(figure.axes[-1], drive, flat)
+        _plot_heights(figure.axes[-1], found["garage", "given"][0], seen, flat)
         figure.add_subplot(grid[1, 2])
-        _plot_shares(figure.axes[-1], found, cells_us)
+        _plot_shares(figure.axes[-1], found)
     return figure
 
 
-def _plot_heights(axes: Any, drive: Drive, flat: Drive) -> None:  # noqa: ANN401 - of matplotlib
-    minutes = np.arange(len(drive.truth)) * _DT_S / 60.0
-    axes.plot(minutes, drive.truth[:, 2], color=TRUTH, lw=2.5, label="truth")
-    axes.plot(minutes, drive.odometry[:, 2], color=ODOMETRY, lw=1.2, label="odometry alone")
-    axes.plot(minutes, drive.track[:, 2], color=MAP, lw=1.2, label="map, pose cells in 3-D")
+def _plot_heights(axes: Any, given: Drive, seen: Drive, flat: Drive) -> None:  # noqa: ANN401
+    minutes = np.arange(len(seen.truth)) * _DT_S / 60.0
+    axes.plot(minutes, seen.truth[:, 2], color=TRUTH, lw=2.5, label="truth")
+    axes.plot(minutes, seen.odometry[:, 2], color=ODOMETRY, lw=1.2, label="seen, odometry alone")
+    axes.plot(minutes, seen.track[:, 2], color=MAP, lw=1.2, label="seen, map")
+    axes.plot(minutes, given.track[:, 2], color=MAP, lw=1.2, ls=":", label="given, map")
     for i, (one, colour, name) in enumerate(
-        ((flat, LOOP, "2-D cells on another storey"), (drive, MAP, "3-D cells on another storey"))
+        ((flat, LOOP, "in the plane on another storey"), (seen, MAP, "seen, on another storey"))
     ):
         where = np.flatnonzero(one.confused)
         axes.plot(minutes[where], np.full(len(where), -0.7 - 0.5 * i), "|", color=colour, ms=5,
                   label=f"{name}: {len(where)} of {len(minutes)} frames")  # fmt: skip
-    axes.set(xlabel="time (min)", ylabel="height (m)", ylim=(-1.6, 10.0))
+    axes.set(xlabel="time (min)", ylabel="height (m)", ylim=(-1.6, 11.0))
     axes.legend(loc="upper left", ncols=2)
     write_title(axes, "Height, and frames at which storeys are confused", "first drive")
 
@@ -257,17 +288,14 @@ def _plot_heights(axes: Any, drive: Drive, flat: Drive) -> None:  # noqa: ANN401
 def _plot_shares(
     axes: Any,  # noqa: ANN401 - of matplotlib
     found: Mapping[tuple[str, str], Sequence[Drive]],
-    cells_us: Mapping[str, float],
 ) -> None:
-    names = {"pose": "2-D", "pose_3d": "3-D"}
     labels = []
     for k, ((world, method), each) in enumerate(found.items()):
         share = np.array([100.0 * d.confused.mean() for d in each])
         spread = np.linspace(-0.25, 0.25, len(share)) if len(share) > 1 else np.zeros(1)
-        colour = MAP if method == "pose_3d" else LOOP
-        axes.plot(k + spread, share, ".", color=colour, ms=4)
+        axes.plot(k + spread, share, ".", color=LOOP if method == "plane" else MAP, ms=4)
         n = sum(bool(d.confused.any()) for d in each)
-        labels.append(f"{world}\n{names[method]}\n{n} of {len(each)}\n{cells_us[method]:.0f} µs")
+        labels.append(f"{world}\n{method}\n{n} of {len(each)}")
     axes.set_xticks(range(len(labels)), labels)
     axes.set(ylabel="frames on another storey (%)", ylim=(-3.0, None))
-    write_title(axes, "Each drive", "drives confused; cells a step")
+    write_title(axes, "Each drive", "drives confused")

@@ -12,6 +12,7 @@ reweighted least squares. The displacement is that of the floor (:mod:`neuroslam
 """
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -79,12 +80,20 @@ class Picture(NamedTuple):
     held_s: float
 
 
-def follow_corners(before: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def follow_corners(
+    before: np.ndarray,
+    now: np.ndarray,
+    window_px: int = _WINDOW_PX,
+    expected: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Follow corners from one grey image to the next, and back.
 
     Args:
         before: ``uint8``, ``(h, w)``.
         now: The same size.
+        window_px: Width of what is compared; larger: corners are followed farther, and their
+            positions on inclined surfaces are less accurate.
+        expected: Where corners at ``(n, 2)`` are looked for first; ``None``: where they were.
 
     Returns:
         Positions in both, px, each ``(n, 2)``, of the corners that come back to where they began.
@@ -106,9 +115,14 @@ def follow_corners(before: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.
     if not found:
         return np.empty((0, 2)), np.empty((0, 2))
     start = np.concatenate(found).astype(np.float32)[:, None]
-    window = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": _LEVELS}
-    end, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, start.copy(), **window)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, end, end.copy(), **window)
+    window = {"winSize": (window_px, window_px), "maxLevel": _LEVELS}
+    guess, undo = start.copy(), np.zeros_like(start)
+    if expected is not None:
+        window["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+        guess = np.array(expected(start[:, 0]), np.float32, order="C").reshape(-1, 1, 2)
+        undo = guess - start
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, guess, **window)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, end, end - undo, **window)
     kept = (there[:, 0] == 1) & (again[:, 0] == 1)
     kept &= np.hypot(*(back - start)[:, 0].T) < _BACK_PX
     kept &= ((end[:, 0] >= 0) & (end[:, 0] <= np.array(now.shape)[::-1] - 1)).all(axis=1)

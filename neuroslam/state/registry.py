@@ -17,8 +17,8 @@ from neuroslam.state.population import Population
 Kind = TypeVar("Kind", bound=type[Population])
 
 BRAIN_NAMES = frozenset({
-    "about", "clock", "compass", "config", "continuity", "half_taken", "landmarks_m", "largest",
-    "leader", "map", "merge", "navigation", "not_joined", "odometry", "parts", "place",
+    "about", "climb", "clock", "compass", "config", "continuity", "half_taken", "landmarks_m",
+    "largest", "leader", "map", "merge", "navigation", "not_joined", "odometry", "parts", "place",
     "populations", "pose_cells", "recognition", "restore", "semantic", "sessions", "start_new_map",
     "store", "stored", "tracker", "view",
 })  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from neuroslam.geometry import TWO_PI, rotation_matrix
 from neuroslam.types import Pose
 from neuroslam.worlds.atlas import LEVELS_GROUND, LEVELS_U, LEVELS_V, Atlas
+from neuroslam.worlds.ramps import draw_inclined, in_view, larger_camera, warp
 from neuroslam.worlds.scene import Billboard, Surface, World
 
 _NO_HIT = 1e6  # depth (m) of a ray that hits nothing
@@ -93,6 +94,7 @@ def render(
     camera: Camera,
     figures: Sequence[Billboard] = (),
     gain: float = 1.0,
+    pitch_rad: float | None = None,
 ) -> np.ndarray:
     """Render the image of a camera.
 
@@ -102,17 +104,47 @@ def render(
         camera: The camera.
         figures: Figures in addition to those of the world, such as pedestrians.
         gain: Factor on all grey levels, clipped at white.
+        pitch_rad: Pitch of a pinhole camera upwards, in a world whose ramps are drawn; ``None``:
+            it is level, and so are the ramps.
 
     Returns:
         ``uint8 (height, width, 3)``, RGB.
     """
+    shown, pitch = camera, pitch_rad or 0.0
+    camera, ramps = larger_camera(camera, pitch), () if pitch_rad is None else world.ramps
     rays = camera.rays @ rotation_matrix(pose.theta_rad).T
     layers = cast(world, pose, rays, camera.camera_height_m)
     length = np.hypot(rays[:, 0], rays[:, 1]).astype(np.float32)
-    slopes = camera.slopes[:, None]
-
-    shape = (len(slopes), camera.width)
+    shape = (len(camera.slopes), camera.width)
     columns, rows, clear = (np.empty(shape, dtype=np.float32) for _ in range(3))
+    if not pitch_rad and not in_view(ramps, pose, rays, layers[-1].depth):
+        _draw_level(world, pose, rays, camera, layers, length, (columns, rows, clear))
+    else:
+        draw_inclined(world, pose, rays, camera, layers[-1], length, columns, rows, clear)
+    np.exp(clear * np.float32(-1.0 / world.sight_m), out=clear)
+
+    image = cv2.remap(world.atlas.image, columns, rows, cv2.INTER_LINEAR)
+    haze = np.empty_like(image)
+    haze[:] = world.haze
+    image = cv2.blendLinear(image, haze, clear, 1.0 - clear)
+    _draw_figures(image, world, pose, rays, camera, figures, layers)
+    image = warp(image, camera, shown, pitch)
+    image = cv2.resize(image, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
+    return image if gain == 1.0 else cv2.convertScaleAbs(image, alpha=gain)
+
+
+def _draw_level(
+    world: World,
+    pose: Pose,
+    rays: np.ndarray,
+    camera: Camera,
+    layers: list[Hits],
+    length: np.ndarray,
+    buffers: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Write, for every pixel, its position in the atlas and its distance: floors are level."""
+    columns, rows, clear = buffers
+    slopes = camera.slopes[:, None]
     sky_rows = int(np.count_nonzero(slopes > 0.0))
     _draw_flat(world, world.ground, pose, rays, camera, slice(sky_rows, None), columns, rows)
     clear[sky_rows:] = -camera.camera_height_m / slopes[sky_rows:] * length
@@ -125,15 +157,6 @@ def render(
         clear[:sky_rows] = 0.0
     for hits in layers:
         _draw_upright(world.atlas, hits, camera, length, columns, rows, clear)
-    np.exp(clear * np.float32(-1.0 / world.sight_m), out=clear)
-
-    image = cv2.remap(world.atlas.image, columns, rows, cv2.INTER_LINEAR)
-    haze = np.empty_like(image)
-    haze[:] = world.haze
-    image = cv2.blendLinear(image, haze, clear, 1.0 - clear)
-    _draw_figures(image, world, pose, rays, camera, figures, layers)
-    image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return image if gain == 1.0 else cv2.convertScaleAbs(image, alpha=gain)
 
 
 def cast(world: World, pose: Pose, rays: np.ndarray, eye_m: float) -> list[Hits]:

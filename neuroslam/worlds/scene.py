@@ -9,6 +9,7 @@ import numpy as np
 
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.worlds.atlas import Atlas, halvings
+from neuroslam.worlds.ramps import Ramp
 
 
 class Surface(NamedTuple):
@@ -96,6 +97,23 @@ class Route:
             return np.zeros(n)
         return np.interp(np.arange(n) * (self.length_m / n), self._along, self._heights)
 
+    def pitches(self, n: int, wheelbase_m: float) -> np.ndarray:
+        r"""Return the pitch of a vehicle at the same poses, radians upwards, ``(n,)``.
+
+        .. math:: \tan p = \bigl(z(s + \tfrac{l}{2}) - z(s - \tfrac{l}{2})\bigr) / l
+
+        Args:
+            n: Number of poses.
+            wheelbase_m: Distance :math:`l` of its axles.
+        """
+        if self._heights is None:
+            return np.zeros(n)
+        s, half = np.arange(n) * (self.length_m / n), 0.5 * wheelbase_m
+        front, rear = (
+            np.interp((s + by) % self.length_m, self._along, self._heights) for by in (half, -half)
+        )
+        return np.asarray(np.arctan2(front - rear, wheelbase_m))
+
     def poses(self, n: int) -> np.ndarray:
         """Return ``n`` equidistant poses of one lap, shape ``(n, 3)``."""
         return self.at(np.arange(n) * (self.length_m / n))
@@ -111,7 +129,10 @@ def ellipse_route(
 
 
 def rounded_route(
-    corners_m: list[tuple[float, float]], radius_m: float, heights_m: list[float] | None = None
+    corners_m: list[tuple[float, float]],
+    radius_m: float,
+    heights_m: list[float] | None = None,
+    level_arcs: bool = False,
 ) -> Route:
     """Return a closed polygon with rounded corners; it starts in the middle of its first side.
 
@@ -120,6 +141,7 @@ def rounded_route(
         radius_m: Radius of the arcs; smaller where a side is too short for it.
         heights_m: Height at the middle of each arc, between which the path rises evenly; ``None``:
             it is level.
+        level_arcs: The arcs are level, and the path rises between them.
     """
     corners = np.asarray(corners_m, dtype=float)
     n = len(corners)
@@ -127,7 +149,8 @@ def rounded_route(
     lengths = np.hypot(*sides.T)
     headings = np.arctan2(sides[:, 1], sides[:, 0])
     at = (corners[0] + corners[1]) / 2.0
-    arcs: list[int] = []  # number of the point in the middle of each arc, from the second corner
+    # Numbers of the first, middle and last point of each arc, from the second corner on.
+    arcs: list[tuple[int, int, int]] = []
     points: list[np.ndarray] = []
     angles: list[np.ndarray] = []
     for i in range(n):  # along side i to its end, then around the corner there
@@ -146,8 +169,8 @@ def rounded_route(
             phi = headings[i] + bow - side * math.pi / 2.0
             points.append(centre + radius * np.column_stack([np.cos(phi), np.sin(phi)]))
             angles.append(headings[i] + bow)
-        n_points = sum(map(len, points))
-        arcs.append(n_points - 1 - (len(points[-1]) // 2 if half > 1e-9 else 0))
+        last, size = sum(map(len, points)) - 1, len(points[-1]) if half > 1e-9 else 1
+        arcs.append((last - size + 1, last - size // 2 if size > 1 else last, last))
         at = corners[j] + cut * w
     _add_line(points, angles, at, (corners[0] + corners[1]) / 2.0, headings[0])
     path = np.vstack(points)
@@ -156,7 +179,10 @@ def rounded_route(
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
     knots = np.array([*heights_m[1:], heights_m[0]])
     end = (heights_m[0] + heights_m[1]) / 2.0  # the path begins in the middle of the first side
-    z = np.interp(along, [0.0, *along[arcs], along[-1]], [end, *knots, end])
+    first, middle, last = np.array(arcs).T
+    at_m = along[np.column_stack([first, last]).ravel() if level_arcs else middle]
+    z_m = np.repeat(knots, 2) if level_arcs else knots
+    z = np.interp(along, [0.0, *at_m, along[-1]], [end, *z_m, end])
     return Route(path, np.concatenate(angles), z)
 
 
@@ -198,8 +224,9 @@ class World:
         lanes_m: Offsets to the left of the route at which pedestrians walk.
         sense: Default camera and motion, see :class:`Sense`.
         flown: Whether heights of a route are above the one floor of the world, as of a drone;
-            else it has as many storeys that look alike as its routes climb to, and ramps are drawn
-            level.
+            else it has as many storeys that look alike as its routes climb to.
+        ramps: Inclined floors between its storeys.
+        storey_m: From floor to floor.
     """
 
     name: str
@@ -222,6 +249,8 @@ class World:
     haze: tuple[int, int, int] = (90, 88, 84)
     sight_m: float = 18.0
     flown: bool = False
+    ramps: tuple[Ramp, ...] = ()
+    storey_m: float = 3.0
 
     @cached_property
     def atlas(self) -> Atlas:

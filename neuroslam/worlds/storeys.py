@@ -3,6 +3,7 @@
 import numpy as np
 
 from neuroslam.worlds import paint, paint_outdoors
+from neuroslam.worlds.ramps import Ramp
 from neuroslam.worlds.scene import Route, Sense, Surface, World, rounded_route
 from neuroslam.worlds.site import Painter, Point, Site
 
@@ -63,14 +64,19 @@ def garage(look: int) -> World:
         description=(garage.__doc__ or "").split("\n")[0],
         ground=Surface(ground.image, 32.0, -9.7, -7.7, 0.0),
         ceiling=Surface(lights.image, 24.0, -9.7, -7.7, tall),
-        routes=[_route(*_tour([1, 1, -1, -1], 2)), rounded_route(_RING, 1.5)],
+        routes=[
+            _route(*_tour([1, 1, -1, -1], 2), level_arcs=True),
+            rounded_route(_RING, 1.5),
+        ],
         sense=Sense(frames_per_lap=1900, laps=1.0),
         sight_m=16.0,
+        ramps=(Ramp(-6.5, 6.5, 0.8, 3.2, STOREY_M), Ramp(-6.5, 6.5, -3.2, -0.8, -STOREY_M)),
+        storey_m=STOREY_M,
     )
 
 
-def _route(corners: list[Point], heights: list[float]) -> Route:
-    return rounded_route(corners, 1.5, heights)
+def _route(corners: list[Point], heights: list[float], level_arcs: bool = False) -> Route:
+    return rounded_route(corners, 1.5, heights, level_arcs)
 
 
 def _stack(one: Painter, n: int) -> Painter:

@@ -33,6 +33,7 @@ __all__ = [
 
 _PERSON_M = (0.8, 1.8)
 _STEP_M = 0.35
+_WHEELBASE_M = 2.5
 _COMPASS_S = 30.0  # time constant of the slow half of the compass error
 
 
@@ -121,6 +122,11 @@ class WorldOptions(BaseModel):
         default=None, description="panoramic camera; none: the world's default"
     )
     grey: bool = Field(default=False, description="one channel, luma, instead of RGB")
+    ramps: bool = Field(
+        default=True,
+        description="draw ramps as ramps, on which a pinhole camera pitches as a car does; off: "
+        "they are drawn level",
+    )
     look: int = Field(default=0, ge=0, le=LARGEST_SEED, description="seed of the textures")
     seed: int = Field(
         default=0,
@@ -275,6 +281,8 @@ class WorldSource(IndexedSource):
         lap = self.route.poses(self.frames_per_lap)
         lap_heights = self.route.heights(self.frames_per_lap)
         along = first + np.arange(self.n_frames)
+        lap_pitches = self.route.pitches(self.frames_per_lap, _WHEELBASE_M)
+        self._pitches = lap_pitches[along % self.frames_per_lap]
         self._truths = lap[along % self.frames_per_lap]
         self._heights = lap_heights[along % self.frames_per_lap]
         moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
@@ -286,6 +294,7 @@ class WorldSource(IndexedSource):
                 cuts.append(max(1, round(float(at_s) * options.rate)))
                 along[cuts[-1] :] += round(float(share) * n)
             self._truths, self._heights = lap[along % n], lap_heights[along % n]
+            self._pitches = lap_pitches[along % n]
             moved = np.diff(self._truths, axis=0, prepend=self._truths[:1])
             climbed = np.diff(self._heights, prepend=self._heights[:1])
             for at in [at for at in cuts if at < self.n_frames]:  # odometry does not measure it
@@ -329,6 +338,13 @@ class WorldSource(IndexedSource):
         """Return the true height of all frames, ``(n_frames,)`` in metres; 0 in the plane."""
         return self._heights.copy()
 
+    def pitches(self) -> np.ndarray:
+        """Return the true pitch of the vehicle at all frames, ``(n_frames,)``, radians upwards.
+
+        That of a car between its axles; 0 in a world that is flown, whose camera stays level.
+        """
+        return np.zeros(self.n_frames) if self.world.flown else self._pitches.copy()
+
     def climbs(self) -> np.ndarray:
         """Return the measured speed upwards of all frames, ``(n_frames,)`` in m/s."""
         return self._climbs.copy()
@@ -366,7 +382,9 @@ class WorldSource(IndexedSource):
         if self.world.flown and self.route.climbs:
             height = camera.camera_height_m + float(self._heights[index])
             camera = replace(camera, camera_height_m=height)
-        image = render(self.world, pose, camera, self.figures(time_s), self.gain(time_s))
+        inclined = self.world.ramps and self.options.ramps and not camera.panoramic
+        pitch = float(self._pitches[index]) if inclined else None
+        image = render(self.world, pose, camera, self.figures(time_s), self.gain(time_s), pitch)
         if self.options.grey:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if _within(time_s, self._dark):
