@@ -63,7 +63,7 @@ class OdometryConfig(Section):
         "on its way up, as a drone's. method says how images are compared",
     )
     level_deg: float = Field(
-        default=3.0,
+        default=5.0,
         ge=0,
         lt=45,
         description="climb = pitch: pitch below which the ground counts as level, in degrees; "
@@ -152,7 +152,7 @@ class OdometryConfig(Section):
             raise ValueError("use = 'fused' needs method = 'flow': profiles have no variance")
         if self.climb == "pitch" and self.method != "flow":
             raise ValueError(
-                "climb = 'pitch' needs method = 'flow': the profile of the rows moves by the speed too"
+                "climb = 'pitch' needs method = 'flow': the speed too moves the profile of the rows"
             )
         if self.climb != "given" and self.fov_deg > 150.0:
             raise ValueError(

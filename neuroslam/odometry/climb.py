@@ -11,10 +11,10 @@ about the middle of the motion,
           - \frac{\varphi}{2} (z_2 y_1 + z_1 y_2)
 
 to first order, so corners to the left and right of the direction of travel determine pitch and
-slope. The estimate begins with the value on which most corners agree, and is refined by iteratively
-reweighted least squares with prior deviations. A car moves along its axis, but for the ends of ramps
-and the mounting of its camera: :math:`\tau` is 0 with a deviation of 0.05. A camera that stays level
-has no :math:`\psi`, and :math:`\tau = v_z / v`.
+slope. The estimate begins with the value on which most corners agree, and is refined by
+iteratively reweighted least squares with prior deviations. A car moves along its axis, but for the
+ends of ramps and the mounting of its camera: :math:`\tau` is 0 with a deviation of 0.02. A camera
+that stays level has no :math:`\psi`, and :math:`\tau = v_z / v`.
 
 Pitch is integrated, so it drifts. Floors of buildings are level: where the pitch :math:`p` is below
 :math:`p_0`, it decays and nothing is climbed,
@@ -24,8 +24,8 @@ Pitch is integrated, so it drifts. Floors of buildings are level: where the pitc
 
 With ``method = "profiles"`` the vertical shift :math:`s` of the intensity profile of the rows
 measures the speed upwards of a level camera, as NeuroSLAM's visual odometry does (Yu, Shang, Hu,
-Milford et al., Biological Cybernetics 113, 2019): :math:`v_z = s D / (f \Delta t)` for a scene at the
-distance :math:`D`.
+Milford et al., Biological Cybernetics 113, 2019): :math:`v_z = s D / (f \Delta t)` for a scene at
+the distance :math:`D`.
 """
 
 import math
@@ -53,8 +53,8 @@ _NEAR = 20.0  # standard deviations of a ray that the denominator of an estimate
 _HOLD_S = 0.5  # for which the last rate is believed without an estimate
 _FEWEST, _HUBER, _ITERATIONS = 8, 1.345, 5
 _PRIOR = {  # inverse variances of pitch, slope and turn, of a car and of a level camera
-    True: (1e-6, 0.02**-2, 0.05**-2),
-    False: (1e10, 1e-6, 0.05**-2),
+    True: (1e-6, 0.02**-2, 0.03**-2),
+    False: (1e10, 1e-6, 0.03**-2),
 }
 _WINDOW_PX = 9  # compared around a corner; of a large one the lower half moves faster over a floor
 
@@ -126,7 +126,9 @@ def vertical_of_rays(
     measured, of = (x1 * y2 - y1 * x2) / noise, 0 if pitches else 1
     factors /= noise[:, None]
     near = np.abs(factors[:, of]) > (_NEAR if pitches else 3.0)
-    first = agreed(measured[near] / factors[near, of], 1.0 / np.abs(factors[near, of]))
+    others = factors * (np.arange(3) != of) / np.sqrt(_PRIOR[pitches])  # by what is not known yet
+    sigma = np.sqrt(1.0 + (others[near] ** 2).sum(axis=1)) / np.abs(factors[near, of])
+    first = agreed(measured[near] / factors[near, of], sigma)
     if first is None:
         return None
     found = np.zeros(3)
