@@ -52,6 +52,7 @@ _PIXEL_ERROR = 0.15  # standard deviation of a followed corner, px
 _NEAR = 20.0  # standard deviations of a ray that the denominator of an estimate exceeds
 _HOLD_S = 0.5  # for which the last rate is believed without an estimate
 _FEWEST, _HUBER, _ITERATIONS = 8, 1.345, 5
+_QUARTER = 0.3186  # of normal errors, in standard deviations, a quarter is below it
 _PRIOR = {  # inverse variances of pitch, slope and turn, of a car and of a level camera
     True: (1e-6, 0.02**-2, 0.03**-2),
     False: (1e10, 1e-6, 0.03**-2),
@@ -127,22 +128,30 @@ def vertical_of_rays(
     factors /= noise[:, None]
     near = np.abs(factors[:, of]) > (_NEAR if pitches else 3.0)
     others = factors * (np.arange(3) != of) / np.sqrt(_PRIOR[pitches])  # by what is not known yet
-    sigma = np.sqrt(1.0 + (others[near] ** 2).sum(axis=1)) / np.abs(factors[near, of])
+    slack = np.sqrt(1.0 + (others**2).sum(axis=1))
+    if near.sum() < _FEWEST:
+        return None
+    sigma = slack[near] / np.abs(factors[near, of])
+    # A false match of a large displacement must not outvote all others.
+    sigma = np.maximum(sigma, 0.5 * np.median(sigma))
     first = agreed(measured[near] / factors[near, of], sigma)
     if first is None:
         return None
     found = np.zeros(3)
     found[of] = first.value
     prior = np.diag(_PRIOR[pitches])
-    scale = max(1.0, 1.4826 * float(np.median(np.abs(measured - factors @ found))))
+    # The first residuals are large by the turn; false matches are most of the other three quarters.
+    lowest = float(np.quantile(np.abs(measured - factors @ found) / slack, 0.25))
+    scale = max(1.0, lowest / _QUARTER)
     for _ in range(_ITERATIONS):
         residual = np.abs(measured - factors @ found)
-        inside = residual < 4.0 * max(scale, 1.0)
+        inside = residual < 4.0 * scale * slack
         if inside.sum() < _FEWEST:
             return None
-        scale = max(1.4826 * float(np.median(residual[inside])), 1e-3)
-        huber = np.minimum(1.0, _HUBER * scale / np.maximum(residual, 1e-12))
-        weighted = factors * np.where(inside, huber / max(scale, 1.0) ** 2, 0.0)[:, None]
+        spread = max(1.4826 * float(np.median(residual[inside])), 1e-3)
+        huber = np.minimum(1.0, _HUBER * spread / np.maximum(residual, 1e-12))
+        scale, slack = max(spread, 1.0), np.ones_like(slack)
+        weighted = factors * np.where(inside, huber / scale**2, 0.0)[:, None]
         found = np.linalg.solve(weighted.T @ factors + prior, weighted.T @ measured)
     return float(found[0]), float(found[1])
 
@@ -167,7 +176,7 @@ def turned_pixels(
     Example:
         >>> seen = np.array([[79.5, 9.5]])
         >>> turned_pixels(seen, (60, 160), 80.0, math.atan(0.5)).round(1).tolist()
-        [[119.5, 6.6]]
+        [[119.5, 7.1]]
     """
     middle = np.array([0.5 * size[1] - 0.5, 0.5 * size[0] - 0.5])
     rays = np.column_stack([(points_px - middle) / focal_px, np.ones(len(points_px))])
