@@ -13,47 +13,19 @@ image is that of a level camera, warped.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from neuroslam.types import Pose
 from neuroslam.worlds.atlas import LEVELS_GROUND, LEVELS_U, LEVELS_V
-
-if TYPE_CHECKING:
-    from neuroslam.types import Pose
-    from neuroslam.worlds.render import Camera, Hits
-    from neuroslam.worlds.scene import World
+from neuroslam.worlds.camera import FINE, Camera, Hits
+from neuroslam.worlds.scene import Ramp, World
 
 _MARGIN = 1.25, 1.7  # width and height of the image that is warped, as shares of the camera's
 _FAR_M = 1e6
 _INSIDE_M = 0.05
-
-
-class Ramp(NamedTuple):
-    """An inclined floor along x, over a rectangle.
-
-    Attributes:
-        x0_m: Where it begins, at the height of its storey.
-        x1_m: Where it ends.
-        y0_m: Its sides.
-        y1_m: The other.
-        rise_m: Height of its end above its begin; negative: it leads down.
-    """
-
-    x0_m: float
-    x1_m: float
-    y0_m: float
-    y1_m: float
-    rise_m: float
-
-    def height(self, x_m: float) -> float:
-        """Return the height above the begin."""
-        return self.rise_m * (x_m - self.x0_m) / (self.x1_m - self.x0_m)
-
-    def covers(self, x_m: float, y_m: float) -> bool:
-        """Return whether a point of the plan is on the ramp."""
-        return self.x0_m < x_m < self.x1_m and self.y0_m < y_m < self.y1_m
 
 
 class Floor(NamedTuple):
@@ -94,7 +66,7 @@ def floors_around(ramps: tuple[Ramp, ...], x_m: float, y_m: float) -> tuple[list
     return found, 0.0
 
 
-def in_view(ramps: tuple[Ramp, ...], pose: "Pose", rays: np.ndarray, depth: np.ndarray) -> bool:
+def in_view(ramps: tuple[Ramp, ...], pose: Pose, rays: np.ndarray, depth: np.ndarray) -> bool:
     """Return whether a column shows a ramp before the wall at which it ends.
 
     Args:
@@ -118,7 +90,7 @@ def in_view(ramps: tuple[Ramp, ...], pose: "Pose", rays: np.ndarray, depth: np.n
     return False
 
 
-def larger_camera(camera: "Camera", pitch_rad: float) -> "Camera":
+def larger_camera(camera: Camera, pitch_rad: float) -> Camera:
     """Return a level camera whose image has all that a pitched one shows."""
     if not pitch_rad:
         return camera
@@ -129,7 +101,7 @@ def larger_camera(camera: "Camera", pitch_rad: float) -> "Camera":
     return replace(camera, width=width, height=height, fov_deg=fov, horizon=rows / height)
 
 
-def warp(level: np.ndarray, of: "Camera", camera: "Camera", pitch_rad: float) -> np.ndarray:
+def warp(level: np.ndarray, of: Camera, camera: Camera, pitch_rad: float) -> np.ndarray:
     """Warp the fine rows of a level camera's image to those of a pitched one.
 
     Args:
@@ -144,9 +116,8 @@ def warp(level: np.ndarray, of: "Camera", camera: "Camera", pitch_rad: float) ->
     right = (np.arange(camera.width) + 0.5 - 0.5 * camera.width) / camera.focal_px
     ahead = math.cos(pitch_rad) - slopes * math.sin(pitch_rad)
     up = (math.sin(pitch_rad) + slopes * math.cos(pitch_rad)) / ahead
-    fine = len(camera.slopes) / camera.height
     columns = right / ahead * of.focal_px + 0.5 * of.width - 0.5
-    rows = (of.horizon * of.height - up * of.focal_px) * fine - 0.5
+    rows = (of.horizon * of.height - up * of.focal_px) * FINE - 0.5
     rows = np.broadcast_to(rows, columns.shape)
     return cv2.remap(
         level, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR,
@@ -155,11 +126,11 @@ def warp(level: np.ndarray, of: "Camera", camera: "Camera", pitch_rad: float) ->
 
 
 def draw_inclined(
-    world: "World",
-    pose: "Pose",
+    world: World,
+    pose: Pose,
     rays: np.ndarray,
-    camera: "Camera",
-    near: "Hits",
+    camera: Camera,
+    near: Hits,
     length: np.ndarray,
     columns: np.ndarray,
     rows: np.ndarray,
@@ -193,8 +164,7 @@ def draw_inclined(
         depth[shown] = nearest[shown]
         d, row, column = nearest[shown], *np.nonzero(shown)
         drop = np.maximum(np.abs(slopes[row, 0]) * d, 0.2)
-        fine = len(slopes) / camera.height
-        footprint = d / camera.focal_px * np.sqrt(d / drop / fine)
+        footprint = d / camera.focal_px * np.sqrt(d / drop / FINE)
         level = np.clip(np.log2(footprint * surface.px_per_m), 0, LEVELS_GROUND - 1).astype(int)
         left, top, scale_x, scale_y = tiles[level].T.astype(float)
         y_top = surface.y_m + surface.image.shape[0] / surface.px_per_m
@@ -205,7 +175,7 @@ def draw_inclined(
 
 
 def _meets(
-    inclined: list[Floor], pose: "Pose", rays: np.ndarray, slopes: np.ndarray, eye: float
+    inclined: list[Floor], pose: Pose, rays: np.ndarray, slopes: np.ndarray, eye: float
 ) -> np.ndarray:
     """Return the depth at which each pixel meets the nearest part of a floor, else far away."""
     nearest = np.full((len(slopes), len(rays)), _FAR_M)
@@ -230,9 +200,9 @@ def _within(part: Floor, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _draw_walls(
-    world: "World",
-    hits: "Hits",
-    camera: "Camera",
+    world: World,
+    hits: Hits,
+    camera: Camera,
     slopes: np.ndarray,
     eye: float,
     columns: np.ndarray,
@@ -240,10 +210,9 @@ def _draw_walls(
 ) -> None:
     """Write the position of the nearest wall, upright on every storey, in all rows."""
     atlas = world.atlas
-    fine = len(slopes) / camera.height
     per_m = atlas.strip_per_m[hits.strip]
     per_column = per_m * hits.depth / (camera.focal_px * hits.slant)
-    per_row = per_m * hits.depth / (fine * camera.focal_px)
+    per_row = per_m * hits.depth / (FINE * camera.focal_px)
     u = np.clip(np.log2(per_column) + 0.5, 0, LEVELS_U - 1).astype(int)
     v = np.clip(np.log2(per_row) + 0.5, 0, LEVELS_V - 1).astype(int)
     origin = atlas.strip_origin[hits.strip, u, v].astype(float)

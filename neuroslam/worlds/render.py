@@ -2,9 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,80 +9,12 @@ import numpy as np
 from neuroslam.geometry import TWO_PI, rotation_matrix
 from neuroslam.types import Pose
 from neuroslam.worlds.atlas import LEVELS_GROUND, LEVELS_U, LEVELS_V, Atlas
+from neuroslam.worlds.camera import FINE, Camera, Hits
 from neuroslam.worlds.ramps import draw_inclined, in_view, larger_camera, warp
 from neuroslam.worlds.scene import Billboard, Surface, World
 
 _NO_HIT = 1e6  # depth (m) of a ray that hits nothing
 _NEAR_M = 0.15  # nearer figures are not drawn
-_FINE = 2  # rows rendered per row of the image, so that slanted edges are smooth
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A level camera whose middle column looks ahead; the left half of the image shows the left.
-
-    A point at ``depth`` along a column's ray and ``z`` above the camera is ``focal_px * z / depth``
-    pixels above the horizon. Pinhole: depth is measured along the axis, columns are equally wide on
-    a plane. Panoramic: depth is the distance, columns are equal angles of the full turn.
-
-    Attributes:
-        width: Number of columns.
-        height: Number of rows.
-        fov_deg: Horizontal field of view; ignored if panoramic.
-        panoramic: Whether the image is a cylindrical panorama of the full turn.
-        camera_height_m: Height above the floor.
-        horizon: Row of the horizon as a fraction of the height, from the top.
-
-    Example:
-        >>> Camera(width=160, height=60, fov_deg=90.0).focal_px
-        80.0
-    """
-
-    width: int = 160
-    height: int = 64
-    fov_deg: float = 90.0
-    panoramic: bool = False
-    camera_height_m: float = 1.1
-    horizon: float = 0.5
-
-    @cached_property
-    def focal_px(self) -> float:
-        """Focal length in pixels: pixels per unit of slope."""
-        if self.panoramic:
-            return self.width / TWO_PI
-        return round(0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2.0), 9)
-
-    @cached_property
-    def rays(self) -> np.ndarray:
-        """Ray of each column at depth 1, ``(width, 2)``, in the robot's axes: x forward, y left."""
-        right = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_px
-        if self.panoramic:
-            return np.column_stack([np.cos(right), -np.sin(right)])
-        return np.column_stack([np.ones(self.width), -right])
-
-    @cached_property
-    def slopes(self) -> np.ndarray:
-        """Slope of each rendered row, positive upwards, ``float32 (_FINE * height,)``."""
-        rows = (np.arange(_FINE * self.height) + 0.5) / _FINE
-        return ((self.horizon * self.height - rows) / self.focal_px).astype(np.float32)
-
-
-class Hits(NamedTuple):
-    """The surface that the ray of each column hits; all arrays have shape ``(width,)``.
-
-    Attributes:
-        depth: Depth of the hit in units of the ray.
-        strip: Texture of the surface.
-        along_m: Position on the texture.
-        slant: Sine of the angle between ray and surface, times the length of the ray.
-        top_m: Height of the surface.
-    """
-
-    depth: np.ndarray
-    strip: np.ndarray
-    along_m: np.ndarray
-    slant: np.ndarray
-    top_m: np.ndarray
 
 
 def render(
@@ -262,7 +191,7 @@ def _draw_upright(
     """Write, for every pixel of these walls, its position in the atlas and its distance."""
     per_m = atlas.strip_per_m[hits.strip]
     per_column = per_m * hits.depth / (camera.focal_px * hits.slant)
-    per_row = per_m * hits.depth / (_FINE * camera.focal_px)
+    per_row = per_m * hits.depth / (FINE * camera.focal_px)
     u = np.clip(np.log2(per_column) + 0.5, 0, LEVELS_U - 1).astype(int)
     v = np.clip(np.log2(per_row) + 0.5, 0, LEVELS_V - 1).astype(int)
     origin = atlas.strip_origin[hits.strip, u, v]
@@ -296,7 +225,7 @@ def _draw_flat(
     rise = surface.height_m - camera.camera_height_m
     depth = rise / slopes
     # A pixel's footprint: depth / f across, depth^2 / (rise f) along; their geometric mean.
-    footprint = depth / camera.focal_px * np.sqrt(np.abs(depth / rise) / _FINE)
+    footprint = depth / camera.focal_px * np.sqrt(np.abs(depth / rise) / FINE)
     level = np.clip(np.log2(footprint * surface.px_per_m), 0, LEVELS_GROUND - 1).astype(int)
     left, top, scale_x, scale_y = tiles[level].T.astype(float)
     scale_x, scale_y = scale_x * surface.px_per_m, scale_y * surface.px_per_m
@@ -380,7 +309,7 @@ def _blend(
     slope = camera.slopes[first:last, None]
 
     levels = world.figure_levels[figure.cutout]
-    per_row = levels[0].shape[0] / figure.height_m * distance / (_FINE * camera.focal_px)
+    per_row = levels[0].shape[0] / figure.height_m * distance / (FINE * camera.focal_px)
     texture = levels[min(max(int(math.log2(per_row) + 0.3), 0), len(levels) - 1)]
     h, w = texture.shape[:2]
     v = (figure.height_m - eye - slope * depth) * (h / figure.height_m) - 0.5

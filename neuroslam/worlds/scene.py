@@ -9,7 +9,6 @@ import numpy as np
 
 from neuroslam.geometry import TWO_PI, wrap_angle, wrap_angles
 from neuroslam.worlds.atlas import Atlas, halvings
-from neuroslam.worlds.ramps import Ramp
 
 
 class Surface(NamedTuple):
@@ -44,6 +43,32 @@ class Billboard(NamedTuple):
     width_m: float
     height_m: float
     cutout: int
+
+
+class Ramp(NamedTuple):
+    """An inclined floor along x, over a rectangle.
+
+    Attributes:
+        x0_m: Where it begins, at the height of its storey.
+        x1_m: Where it ends.
+        y0_m: Its sides.
+        y1_m: The other.
+        rise_m: Height of its end above its begin; negative: it leads down.
+    """
+
+    x0_m: float
+    x1_m: float
+    y0_m: float
+    y1_m: float
+    rise_m: float
+
+    def height(self, x_m: float) -> float:
+        """Return the height above the begin."""
+        return self.rise_m * (x_m - self.x0_m) / (self.x1_m - self.x0_m)
+
+    def covers(self, x_m: float, y_m: float) -> bool:
+        """Return whether a point of the plan is on the ramp."""
+        return self.x0_m < x_m < self.x1_m and self.y0_m < y_m < self.y1_m
 
 
 class Route:

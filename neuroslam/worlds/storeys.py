@@ -3,8 +3,7 @@
 import numpy as np
 
 from neuroslam.worlds import paint, paint_outdoors
-from neuroslam.worlds.ramps import Ramp
-from neuroslam.worlds.scene import Route, Sense, Surface, World, rounded_route
+from neuroslam.worlds.scene import Ramp, Route, Sense, Surface, World, rounded_route
 from neuroslam.worlds.site import Painter, Point, Site
 
 STOREY_M = 2.7

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from neuroslam.types import Pose
-from neuroslam.worlds.ramps import Ramp, floors_around, in_view, larger_camera, warp
-from neuroslam.worlds.render import Camera, render
+from neuroslam.worlds.camera import Camera
+from neuroslam.worlds.ramps import floors_around, in_view, larger_camera, warp
+from neuroslam.worlds.render import render
+from neuroslam.worlds.scene import Ramp
 from neuroslam.worlds.world import open_world
 
 UP = Ramp(-5.0, 5.0, 1.0, 3.0, 2.0)
