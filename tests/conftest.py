@@ -39,6 +39,14 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the compiled steps: of two processes each compiles half, once for both."""
+    steps = [item for item in items if item.path.name == "test_compiled.py"]
+    others = [item for item in items if item.path.name != "test_compiled.py"]
+    half, middle = len(steps) // 2, len(others) // 2
+    items[:] = [*steps[:half], *others[:middle], *steps[half:], *others[middle:]]
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real recordings and reference outputs, kept beside the checkout."""

@@ -198,7 +198,7 @@ class AssociativeMap(BufferModule):
         if self.config.relay:
             pass_on = self.relay.responder(view(self, "relay_decoders"))
         drive_, memorise_ = drive_by_keys.dispatcher(), memorise.dispatcher()
-        one, silence = rates[7], rates[8]
+        one, silence, fire = rates[7], rates[8], memory.firer()
 
         def step(
             key: np.ndarray,
@@ -210,7 +210,7 @@ class AssociativeMap(BufferModule):
         ) -> np.ndarray:
             nonlocal recalled, spare, spikes
             drive_(key, encoders, bias[0], spikes, same, rates, said, drive[0])
-            spikes = memory.fire_compiled(drive)[0]
+            spikes = fire(drive)[0]
             error_now = answer((relayed - taught)[None], silence * (one - seen))[0]
             passed = recalled if pass_on is None else pass_on(recalled[None], None)[0]
             memorise_(

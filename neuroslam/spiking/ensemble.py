@@ -437,13 +437,24 @@ class NeuronArray(BufferModule):
         deficit = view(self, "deficit")
         if drive.shape != deficit.shape:
             raise ValueError(f"NeuronArray: drive {drive.shape}, expected {deficit.shape}")
+        return self.firer()(drive)
+
+    def firer(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Return :meth:`fire_compiled` for many steps, until a buffer of the neurons is replaced.
+
+        The spikes that it returns are changed by its next call.
+        """
         if self._has_rates:
-            return self.fire(torch.from_numpy(drive)).numpy()
-        asleep, spikes = view(self, "asleep"), self._spikes()
-        rows = (each.reshape(-1) for each in (drive, deficit, asleep, spikes))
-        now, owing, paused, fired = rows
-        fire_row(now, owing, paused, fired, self._constants().lif)
-        return spikes
+            return lambda drive: self.fire(torch.from_numpy(drive)).numpy()
+        spikes, lif, step = self._spikes(), self._constants().lif, fire_row.dispatcher()
+        states = view(self, "deficit"), view(self, "asleep"), spikes
+        owing, paused, fired = (each.reshape(-1) for each in states)
+
+        def fire(drive: np.ndarray) -> np.ndarray:
+            step(drive.reshape(-1), owing, paused, fired, lif)
+            return spikes
+
+        return fire
 
     def _spikes(self) -> np.ndarray:
         deficit, spikes = view(self, "deficit"), view(self, "spikes")

@@ -339,26 +339,51 @@ class PathIntegrator(BasePathIntegrator):
         Returns:
             Fourier coefficients of where the animal is, complex, ``(batch, n_frequencies)``.
         """
-        space = self.space
-        own = space.frequencies, space.length_scale_m
         given = (velocity_m_s,) if pull is None else (velocity_m_s, pull)
-        if (
-            velocity_m_s.shape == cast(Tensor, self._buffers["position_m"]).shape
-            and self.runs_compiled(*own, *given)
-            and may_share(self, "recurrent", "external", "output", "position_m")
-        ):
-            velocity, numbers = velocity_m_s.to(own[0].dtype).contiguous().numpy(), None
+        if self._advances_compiled(velocity_m_s.shape, *given):
+            velocity, numbers = self._as_array(velocity_m_s), None
             if pull is not None:
-                numbers = torch.view_as_real(pull).to(own[0].dtype).contiguous().numpy()
+                numbers = self._as_array(torch.view_as_real(pull))
             return torch.view_as_complex(torch.from_numpy(self.advance(velocity, numbers)))
         if self.velocity is not None:
             velocity_m_s = self.velocity(velocity_m_s)
-        waves = space.wave_vectors
+        waves = self.space.wave_vectors
         share = (velocity_m_s @ (waves / self.fastest_rad_s.unsqueeze(-1)).T).clamp(-1.0, 1.0)
         pull = coupled(self.z, pull, self.position_m, self.space, self.config)
         parts = None if pull is None else torch.view_as_real(pull).transpose(0, 1)
         self.drive(share.T, parts)
         return self.locate(velocity_m_s)
+
+    @torch.inference_mode()
+    def run(self, velocity_m_s: Tensor) -> Tensor:
+        """Advance many steps, without gradients, as :meth:`forward` does one by one.
+
+        Args:
+            velocity_m_s: ``(steps, batch, dimension)``.
+
+        Returns:
+            Fourier coefficients after each step, complex, ``(steps, batch, n_frequencies)``.
+        """
+        if not len(velocity_m_s):
+            return self.z.unsqueeze(0)[:0]
+        if not self._advances_compiled(velocity_m_s.shape[1:], velocity_m_s):
+            return torch.stack([self(velocity) for velocity in velocity_m_s])
+        step, keep = self.stepper()
+        found = np.stack([step(each, None)[0] for each in self._as_array(velocity_m_s)])
+        keep()
+        return torch.view_as_complex(torch.from_numpy(found))
+
+    def _advances_compiled(self, shape: torch.Size, *given: Tensor) -> bool:
+        """Return whether :meth:`advance` takes a velocity of this shape, and these tensors."""
+        own = self.space.frequencies, self.space.length_scale_m
+        return (
+            shape == cast(Tensor, self._buffers["position_m"]).shape
+            and self.runs_compiled(*own, *given)
+            and may_share(self, "recurrent", "external", "output", "position_m")
+        )
+
+    def _as_array(self, numbers: Tensor) -> np.ndarray:
+        return numbers.to(self.space.frequencies.dtype).contiguous().numpy()
 
     def advance(self, velocity: np.ndarray, pull: np.ndarray | None) -> np.ndarray:
         """Advance one step as :meth:`forward` does, by compiled steps.

@@ -40,6 +40,20 @@ def walked(walk, velocity, steps=300):
     return walk.position_m.numpy().copy()
 
 
+@pytest.mark.parametrize("velocity_neurons", [0, 100])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_many_steps_at_once_are_the_steps_one_by_one(velocity_neurons, batch):
+    draw = torch.Generator().manual_seed(3)
+    velocity = 0.2 * torch.randn(150, batch, 2, generator=draw)
+    once, singly = (walk_of(velocity_neurons, batch=batch) for _ in range(2))
+    with torch.inference_mode():
+        each = torch.stack([singly(v) for v in velocity])
+    assert torch.equal(once.run(velocity), each)
+    assert once.run(velocity[:0]).shape == (0, batch, each.shape[-1])
+    for name, value in singly.state_dict().items():
+        assert torch.equal(once.state_dict()[name], value), name
+
+
 @pytest.mark.parametrize("model", ["lif", "stepped_lif", "lif_rate", "relu"])
 def test_the_mean_decoded_velocity_is_right_to_a_hundredth_of_the_highest_speed(model):
     velocity, decoded = said(500, model)
