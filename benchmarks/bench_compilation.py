@@ -48,7 +48,36 @@ def _measure() -> list[tuple[float, float, int, str]]:
     return rows
 
 
+FIRST = {
+    "auto": "world:corridor",
+    "openratslam": "world:corridor",
+    "slrb": "arena:square?minutes=1",
+    "full": "world:corridor?ranges=36&markers=6",
+}
+"""Presets -> sources of a first run, long enough to call every step that the preset needs."""
+
+
+def _first_run(preset: str, source: str) -> float:
+    """Return by how many CPU seconds a first run with a preset takes longer than a second one."""
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = []
+        for _ in range(2):
+            began = sum(os.times()[2:4])
+            subprocess.run(
+                [sys.executable, "-m", "neuroslam", "run", source, "--preset", preset,
+                 "--overwrite", "-o", f"{folder}/run"],
+                check=True, cwd=ROOT, capture_output=True,
+                env=os.environ | {"NUMBA_CACHE_DIR": f"{folder}/cache"},
+            )  # fmt: skip
+            seconds.append(sum(os.times()[2:4]) - began)
+    return seconds[0] - seconds[1]
+
+
 def rows():
+    for preset, source in FIRST.items():
+        yield Row(
+            "first-use compilation", f"run, {preset}", 1e3 * _first_run(preset, source), "15 s"
+        )
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-m", "benchmarks.bench_compilation"], check=True,
