@@ -86,6 +86,10 @@ def draw_odometry(axes: Axes, xy: np.ndarray, whose: str = "", unit: str = "m") 
     _metric(axes)
 
 
+_SHORT, _FEW = 0.03, 30
+"""Share of the extent of the map below which a loop closure is a dot too, if there are few."""
+
+
 def draw_map(
     axes: Axes,
     poses: np.ndarray,
@@ -115,10 +119,14 @@ def draw_map(
         axes.add_collection(lines)
     _draw_experiences(axes, xy, links[~is_loop], session, names)
     if is_loop.any():
-        loops = [*xy[links[is_loop]]]
+        loops = xy[links[is_loop]]
         axes.add_collection(
-            LineCollection(loops, colors=LOOP, lw=1.3, zorder=4, label="loop closure")
+            LineCollection([*loops], colors=LOOP, lw=1.3, zorder=4, label="loop closure")
         )
+        length, extent = np.ptp(loops, axis=1).max(axis=1), np.ptp(xy, axis=0).max()
+        short = loops[length < _SHORT * extent].mean(axis=1)  # hidden by its experiences
+        if len(short) <= _FEW:
+            axes.plot(*short.T, "o", color=LOOP, ms=4.0, mec="white", mew=0.5, zorder=7)
     if true.xy is not None:
         axes.plot(*true.xy.T, "--", color=TRUTH, lw=0.9, zorder=5, label=true.label)
     if len(spots):
