@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from neuroslam.cli.automatic import estimated_for_all, estimates
 from neuroslam.cli.completion import complete_experiment
 from neuroslam.cli.options import (
     Assignments,
@@ -19,6 +20,7 @@ from neuroslam.cli.options import (
     Overwrite,
     Preset,
     RayAddress,
+    RunPreset,
     Sources,
     Start,
     Stop,
@@ -60,6 +62,9 @@ def sweep_command(
     prepare_workers(jobs, ray)
     from neuroslam.runs.sweep import counted_by_cells, sweep, varied
 
+    values = {}
+    if preset == "auto":
+        values = {one: estimates(one, config, tuple(assignments or ()), stop) for one in sources}
     so_far = (0, 0)
 
     def note(done: int, total: int) -> None:
@@ -77,6 +82,7 @@ def sweep_command(
                 preset=preset,
                 config=config,
                 assignments=assignments or (),
+                estimated=values,
                 start=start,
                 stop=stop,
                 on_bad_frame=on_bad_frame.value,
@@ -120,7 +126,7 @@ def say_notes(out: Path, folders: Iterable[str]) -> None:
 def fleet_command(
     sources: Sources,
     out: Out,
-    preset: Preset = None,
+    preset: RunPreset = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
     confirm: Confirm = None,
@@ -144,11 +150,15 @@ def fleet_command(
 
     if confirm is not None:
         assignments = [*(assignments or ()), f"sessions.confirm={confirm}"]
+    given = tuple(assignments or ())
+    settings = resolve_config(preset, config, given)
+    if preset == "auto" or (preset is None and config is None):
+        settings, preset = estimated_for_all(sources, config, given, settings, preset)
     with show_runs("fleet") as on_done:
         report = fleet(
             sources,
             out,
-            resolve_config(preset, config, tuple(assignments or ())),
+            settings,
             preset=preset or "",
             on_bad_frame=on_bad_frame.value,
             jobs=jobs,

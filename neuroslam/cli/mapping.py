@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neuroslam.cli.automatic import estimated
 from neuroslam.cli.options import (
     ArenaOf,
     Assignments,
@@ -123,7 +124,7 @@ def run_command(
         named = preset or ("of the stored map" if maps and config is None else "")
         return _dry_run(source, out, settings, named, config, start, stop, offset, overwrite)
     if preset == "auto" or (preset is None and config is None and base is None):
-        settings, preset = _estimated(source, config, given, stop, offset, settings, preset)
+        settings, preset = estimated(source, config, given, settings, preset, stop, offset)
     with show_frames(source) as (on_start, on_step):
         summary = run(
             source,
@@ -202,40 +203,6 @@ def _dry_run(
         say(note)
     say("Nothing is written: --dry-run")
     return 0
-
-
-def _estimated(
-    source: str,
-    config: Path | None,
-    given: tuple[str, ...],
-    stop: int | None,
-    offset: str | None,
-    settings: "BrainConfig",
-    preset: str | None,
-) -> tuple["BrainConfig", str | None]:
-    """Return the preset ``auto`` with what is estimated from the first laps of the source.
-
-    Without a preset, a source that is too short, or has no pictures, keeps the settings it has.
-    """
-    from neuroslam.runs.clocks import resolve_offset
-    from neuroslam.runs.run import resolve_config
-    from neuroslam.sensors import open_source
-    from neuroslam.tuning.auto import estimate, has_pictures
-
-    source, _ = resolve_offset(source, offset, settings)
-    opened = open_source(source, settings.frame_rate_hz, settings.view.grey)
-    plain = settings.view.features == "grey"
-    if preset is None and not (plain and has_pictures(opened)):
-        return settings, None
-    automatic = resolve_config("auto", config, given)
-    estimates = estimate(opened, automatic, stop)
-    if not plain:  # estimated from grey views
-        estimates.values.pop("view", None)
-    if preset is None and not estimates.values:
-        return settings, None
-    for note in estimates.notes:
-        say(note)
-    return resolve_config("auto", config, given, estimated=estimates.values), "auto"
 
 
 def resume_command(

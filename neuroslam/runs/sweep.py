@@ -5,7 +5,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +94,7 @@ def plan_sweep(
     preset: str | None = None,
     config: Path | None = None,
     assignments: Sequence[str] = (),
+    estimated: Mapping[str, Any] | None = None,
 ) -> list[Trial]:
     """List the runs of a sweep: every combination of source, parameter values and seed.
 
@@ -105,6 +106,7 @@ def plan_sweep(
         preset: As for :func:`neuroslam.runs.run.resolve_config`, like the next two.
         config: A config file.
         assignments: Single values.
+        estimated: Sources -> what is estimated from them, which overrides the preset alone.
 
     Raises:
         ConfigError: If a value is invalid.
@@ -133,7 +135,7 @@ def plan_sweep(
     )
     keys, total, many = tuple(varied), len(combinations), len(sources) > 1
     return [
-        _trial(number, total, combination, keys, many, preset, config, assignments)
+        _trial(number, total, combination, keys, many, preset, config, assignments, estimated or {})
         for number, combination in enumerate(combinations, start=1)
     ]
 
@@ -147,14 +149,16 @@ def _trial(
     preset: str | None,
     config: Path | None,
     assignments: Sequence[str],
+    estimated: Mapping[str, Any],
 ) -> Trial:
     name, *values, seed = combination
     source = absolute_spec(str(name))
     texts = [*assignments, *(f"{key}={_written(v)}" for key, v in zip(keys, values, strict=True))]
     try:
         settings = resolve_config(
-            preset, config, tuple(texts), option="--vary" if keys else "--set"
-        )
+            preset, config, tuple(texts), option="--vary" if keys else "--set",
+            estimated=estimated.get(str(name)),
+        )  # fmt: skip
     except ConfigError:
         resolve_config(
             preset, config, tuple(assignments)
@@ -199,6 +203,7 @@ def sweep(
     preset: str | None = None,
     config: Path | None = None,
     assignments: Sequence[str] = (),
+    estimated: Mapping[str, Any] | None = None,
     start: int = 0,
     stop: int | None = None,
     on_bad_frame: OnBadFrame = "stop",
@@ -213,13 +218,14 @@ def sweep(
     does not stop the others.
 
     Args:
-        sources: As for :func:`plan_sweep`, like the next five but ``out``.
+        sources: As for :func:`plan_sweep`, like the next six but ``out``.
         out: Folder to write; created if missing. With Ray, on a disk shared by all machines.
         vary: Parameters to vary, and their values.
         seeds: Number of seeds.
         preset: Name of a preset.
         config: A config file.
         assignments: Single values.
+        estimated: What is estimated from the sources.
         start: First frame of each source.
         stop: Frame to stop before; default: the end.
         on_bad_frame: As for :func:`neuroslam.runs.run.run`.
@@ -239,7 +245,7 @@ def sweep(
         KeyboardInterrupt: If it is interrupted; the summary holds the runs that ended before.
     """
     out = Path(out).resolve()
-    trials = plan_sweep(sources, vary, seeds, preset, config, assignments)
+    trials = plan_sweep(sources, vary, seeds, preset, config, assignments, estimated)
     if start < 0 or (stop is not None and stop <= start):
         raise RunError(f"start is {start}, stop is {stop}; expected 0 <= start < stop")
     with claimed(out, SUMMARY, overwrite) as (folder, inside):

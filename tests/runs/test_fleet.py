@@ -1,6 +1,7 @@
 """`neuroslam fleet`: each robot maps its own session, then the maps are merged as a tree."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,19 @@ def test_a_fleet_on_one_map_is_exit_0_and_one_that_is_not_3(tmp_path, call):
     assert strict.code == 3
     assert "expected 900 (--confirm)" in strict.out
     assert not (tmp_path / "one" / "merged").exists()
+
+
+def test_without_a_preset_all_robots_have_what_is_estimated_from_the_first(tmp_path, call):
+    given = overlapping()
+    done = call("fleet", tmp_path / "nowhere.avi", *given, "-o", tmp_path / "out")
+    assert done.out.count("auto: views of ") == 1  # of the first that can be read
+    values = [
+        tomllib.loads((tmp_path / "out/sessions" / name / "config.toml").read_text())
+        for name in "23"
+    ]
+    assert all(one.pop("run") for one in values)
+    assert values[0] == values[1]
+    assert values[0]["map"]["closure"] == "sequence"
 
 
 def test_a_failed_session_is_reported_in_one_line_and_stops_no_other(tmp_path, call):

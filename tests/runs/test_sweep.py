@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from itertools import pairwise
 from pathlib import Path
 
@@ -234,6 +235,21 @@ def test_a_failed_run_is_reported_in_one_line_and_stops_no_other(tmp_path, call)
     assert (second["frames"], second["error"]) == (20, "")
     assert not (out / "1-nowhere.avi").exists()
     assert (out / "sweep.png").exists()
+
+
+def test_the_preset_auto_is_estimated_from_each_source(tmp_path, call):
+    size = "frames_per_lap=110&width=160&height=120"
+    done = call(
+        "sweep", f"world:ellipse?{size}", f"world:town?{size}", "-o", tmp_path / "out",
+        "--preset", "auto", "--vary", "map.loops=5,7", "--stop", "130",
+    )  # fmt: skip
+    assert (done.code, done.err) == (0, "")
+    assert done.out.count("auto: views of ") == 2
+    configs = sorted((tmp_path / "out").glob("*/config.toml"))
+    values = [tomllib.loads(path.read_text()) for path in configs]
+    assert [one["map"]["loops"] for one in values] == [5, 7, 5, 7]
+    ellipse, same, town, other = (one["view"]["threshold"] for one in values)
+    assert ellipse == same != town == other
 
 
 def test_an_earlier_sweep_is_kept_without_overwrite(serial, tmp_path, mistake, call):
