@@ -226,11 +226,16 @@ class NavigationBrain(BrainState):
             frame.index, motion, match, frame.heading_rad, tracking=tracking, v_z_m_s=climb
         )
 
-    def _hidden(self) -> np.ndarray | None:
-        """Return which templates cannot match, ``bool (n,)``: those of excluded experiences."""
+    def _excluded(self) -> np.ndarray | None:
+        """Return at which experiences the robot cannot be, ``bool (n,)``; ``None``: at any."""
         masks = [mask for p in self._with["excludes"] if (mask := p.excludes()) is not None]
         excluded = np.logical_or.reduce(masks) if masks else np.zeros(1, dtype=bool)
-        if not excluded.any():
+        return excluded if excluded.any() else None
+
+    def _hidden(self) -> np.ndarray | None:
+        """Return which templates cannot match, ``bool (n,)``: those of excluded experiences."""
+        excluded = self._excluded()
+        if excluded is None:
             return None
         templates = self.map.experiences.array("template")
         hidden = np.zeros(self.view.n + 1, dtype=bool)  # the last: of experiences without a view
@@ -249,7 +254,9 @@ class NavigationBrain(BrainState):
         voters = self._with["weigh"]
         for population in voters:
             population.weigh(of_experience, self.map, motion, self.tracker.tracks, alarm)
-        found = self.tracker.judge(of_experience, self.map, motion, change, alarm, voters)
+        found = self.tracker.judge(
+            of_experience, self.map, motion, change, alarm, voters, self._excluded()
+        )
         recalled = self._recall_stored(view, motion, change, alarm, found)
         if found.kind == "kidnapped" or (recalled and self._jumped(found)):
             self.start_new_map("kidnapped")

@@ -10,7 +10,7 @@ import torch
 from neuroslam.config.sequence import SequenceConfig
 from neuroslam.geometry import TWO_PI, rotate, wrap_angle
 from neuroslam.mapping.experience import ExperienceMap
-from neuroslam.mapping.sequence import UNKNOWN, advance_costs, relative_errors, within_links
+from neuroslam.mapping.sequence import RANGE, UNKNOWN, advance_costs, relative_errors, within_links
 from neuroslam.state.join import Join
 from neuroslam.state.mergeable import Mergeable, State
 from neuroslam.state.population import Population
@@ -223,6 +223,7 @@ class SequenceTracker(Mergeable):
         change: float = 0.0,
         alarm: bool = False,
         voters: Sequence[Population] = (),
+        excluded: np.ndarray | None = None,
     ) -> Tracking:
         """Take the match errors of a frame into the evidence, and say where the robot is.
 
@@ -234,6 +235,8 @@ class SequenceTracker(Mergeable):
             change: Difference of the view from that of the last frame.
             alarm: Whether the view changed too abruptly for driving.
             voters: Who vote on loop closures, and propose some.
+            excluded: Experiences that the robot cannot be at, whatever they look like, ``bool
+                (n,)``: on another storey. They count in the usual match error alone.
         """
         s, c, current = self.state, self.config, map_.current
         self.voters = voters
@@ -269,6 +272,8 @@ class SequenceTracker(Mergeable):
         self.new_view = c.new_view * usual
         s.since_sudden = 0 if change > _SUDDEN * usual else s.since_sudden + 1
         relative = relative_errors(errors, compared)
+        if excluded is not None:
+            compared, relative = compared & ~excluded, np.where(excluded, RANGE[1], relative)
         fresh = self.evidence.array("fresh")
         if not s.since_sudden:
             fresh[:] = 0.0
@@ -289,6 +294,9 @@ class SequenceTracker(Mergeable):
             near = around(current, _APART, _APART + s.doubts)
             return self._doubt(costs, compared, near, around, map_)
         if self.tracks:
+            if excluded is not None and excluded[around(current, 1, _AHEAD + 1)].all():
+                s.origin = s.joined = NO_EXPERIENCE  # a ramp does not contradict a loop closure
+                return self._leave(current)
             return self._track(costs, compared, around, map_)
         best = int(costs.argmin())
         rival = np.where(around(best, _APART, _APART) | _beside(best, map_), UNKNOWN, costs).min()
@@ -376,10 +384,15 @@ class SequenceTracker(Mergeable):
         if s.bad >= c.lost_frames and not self._supported(NO_EXPERIENCE):
             return Tracking("wait", current, -costs[here], -elsewhere[best])
         if s.bad >= c.lost_frames:
-            s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
-            left = Tracking("leave", current, -costs[here], -elsewhere[best])
-            return left._replace(revoked=self._revoke())
+            return self._leave(current, costs[here], elsewhere[best])
         return Tracking("at", current if s.bad else here, -costs[here], -elsewhere[best])
+
+    def _leave(self, current: int, cost: float = 0.0, rival: float = 0.0) -> Tracking:
+        """Explore from where the known places end."""
+        s = self.state
+        s.mode, s.bad, s.doubts = Mode.EXPLORES, 0, 0
+        left = Tracking("leave", current, -float(cost), -float(rival))
+        return left._replace(revoked=self._revoke())
 
     def _doubt(
         self,

@@ -49,7 +49,17 @@ from neuroslam.state.population import (
 from neuroslam.state.registry import register
 from neuroslam.state.renumbering import Renumbering
 from neuroslam.state.tables import GrowingTable, Scalars
-from neuroslam.types import NO_EXPERIENCE, NO_TEMPLATE, Motion, PoseEstimate, ViewMatch
+from neuroslam.types import (
+    NO_EXPERIENCE,
+    NO_TEMPLATE,
+    Motion,
+    PoseEstimate,
+    Revoked,
+    ViewMatch,
+)
+
+_SETTLING = 0.05
+"""Share of its distance in height by which a tracked robot settles at each experience it passes."""
 
 
 class Pose3DConfig(Section):
@@ -125,16 +135,7 @@ class PoseCells3D(Population):
 
     @classmethod
     def build(cls, config: BrainConfig, leader: type[Population]) -> Self:
-        """Make the pose cells of a brain.
-
-        Raises:
-            ConfigError: If sequences of views close loops: they compare all experiences.
-        """
-        if config.map.closure == "sequence":
-            raise ConfigError(
-                "cells = pose_3d: map.closure is 'sequence', which compares the views of all "
-                "storeys; set map.closure to 'view'"
-            )
+        """Make the pose cells of a brain."""
         section = cast(Pose3DConfig, config.section(cls.kind))
         return cls(config.pose_cells, section, config.map)
 
@@ -297,6 +298,24 @@ class PoseCells3D(Population):
         b["decay"].sub_(c.restore).clamp_min_(c.active_decay)
         self.now.view = view.template
 
+    def relocalise(self, view: ViewMatch) -> None:
+        """Move the activity to where a known view is bound: a sequence of views leaves no doubt."""
+        if not 0 <= view.template < self.bindings.n:
+            return
+        n_theta = self.config.n_theta
+        turned = view.relative_heading_rad * n_theta / TWO_PI
+        bound = (self.bindings[name][view.template].item() for name in ("x", "y", "z", "theta"))
+        sizes = (self._sizes[0], self._sizes[1], self._sizes[2], n_theta)
+        dx, dy, dz, turn = (
+            (to + by - at + n / 2) % n - n / 2
+            for to, by, at, n in zip(
+                bound, (0.0, 0.0, 0.0, turned), self.estimate_3d, sizes, strict=True
+            )
+        )
+        self.grid.shift(dx, dy, dz)
+        self.sheet.shift(dz, turn)
+        self.now.injected = 1  # the next step measures no slip across the jump
+
     def _inject_known(self, view: ViewMatch) -> None:
         c, b = self.config, self.bindings
         few = b.n < c.inject_after
@@ -332,8 +351,12 @@ class PoseCells3D(Population):
         """All rises, as arrays; a copy."""
         return Rises(*(self.rises.array(name).copy() for name in Rises._fields))
 
-    def _follow_map(self, before: int, decision: Decision) -> None:
-        """Note the height of a new experience, and the rise to the one that the robot went to."""
+    def _follow_map(self, before: int, decision: Decision, tracked: bool) -> None:
+        """Note the height of a new experience, and the rise to the one that the robot went to.
+
+        A robot that is tracked along known links settles at their height by and by, so that it
+        leaves them where it climbs and they do not.
+        """
         n, there = self.now, decision.experience
         if decision.action == "create":
             self.levels.append(z_m=self.z_m, cell_z=self.estimate_3d.z)
@@ -345,9 +368,26 @@ class PoseCells3D(Population):
             if not known.any():
                 self.rises.append(source=before, target=there, rise_m=n.rise_m)
                 n.at_rest = int(n.at_rest and decision.action == "create")
-        if decision.action != "none":
+        if tracked and decision.action == "link":
+            n.rise_m = (1.0 - _SETTLING) * (self.z_m - float(self.levels.array("z_m")[there]))
+        elif decision.action != "none":
             n.rise_m = 0.0
+        elif there != n.at != NO_EXPERIENCE:  # it left known places near another experience
+            n.rise_m += float(self.levels.array("z_m")[n.at] - self.levels.array("z_m")[there])
         n.at = there
+
+    def _undo(self, revoked: Revoked) -> None:
+        """Drop the rise of a loop closure, and put the robot at the height that it leads by."""
+        source, target, rise = (self.rises.array(name) for name in Rises._fields)
+        row = np.flatnonzero((source == revoked.source) & (target == revoked.target))
+        if not len(row):
+            return
+        z, n = self.levels.array("z_m"), self.now
+        led = z[revoked.target] - z[revoked.source] - rise[row[0]]
+        n.rise_m, n.at = float(self.z_m - led - z[revoked.source]), revoked.source
+        kept = torch.from_numpy(np.arange(self.rises.n) != row[0])
+        self.rises.replace(**{name: self.rises[name][kept] for name in self.rises.columns})
+        n.at_rest = 0
 
     def relax(self) -> float:
         """Reduce the residuals of the rises; return the largest correction, in metres."""
@@ -369,13 +409,19 @@ class PoseCells3D(Population):
 
     def decide(self, map_: LeadableMap, now: StepInput) -> Decision:
         """Create, link or set an experience by the view and the pose-cell estimate."""
-        before = map_.current
+        before, tracking = map_.current, now.tracking
+        if tracking is not None and tracking.kind in ("link", "set"):
+            self.relocalise(now.view)
+        if tracking is not None and tracking.revoked is not None:
+            before = tracking.revoked.source
+            self._undo(tracking.revoked)
         decision = Decision(
             *map_(
-                now.motion, now.view, self.estimate, now.frame, kidnapped=now.vetoed, tracking=None
+                now.motion, now.view, self.estimate, now.frame,
+                kidnapped=now.vetoed, tracking=tracking,
             )
-        )
-        self._follow_map(before, decision)
+        )  # fmt: skip
+        self._follow_map(before, decision, tracking is not None and tracking.kind == "at")
         self.relax()
         return decision
 

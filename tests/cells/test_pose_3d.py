@@ -21,7 +21,7 @@ from neuroslam.geometry import TWO_PI
 from neuroslam.runs.files import experiences_csv, more_columns
 from neuroslam.state.match import Match, Pairs
 from neuroslam.state.population import Correction
-from neuroslam.types import Frame, Motion, Velocity, ViewMatch
+from neuroslam.types import Frame, Motion, Pose, Revoked, Velocity, ViewMatch
 
 EXACT = PoseCellConfig(precision="float64", cell_size_m=0.5)
 SPEEDS = st.floats(-1.0, 1.0)
@@ -183,6 +183,33 @@ def test_storeys_that_look_alike_are_not_confused(drift):
     assert confused(brain_3d(cells=["pose"]), frames, z) > 2 * PLACES
 
 
+def test_sequences_of_views_do_not_match_across_storeys():
+    frames, z = drive([0, 0, 1, 1, 0, 0])
+    brain, flat = (
+        brain_3d(map={"closure": "sequence"}, **more) for more in ({}, {"cells": ["pose"]})
+    )
+    assert confused(brain, frames, z) <= 2
+    assert confused(flat, frames, z) > PLACES
+    assert brain.map.n < 5 * PLACES  # it comes back to both storeys ...
+    heights = brain.pose_3d.experience_heights_m
+    assert np.ptp(heights) == pytest.approx(STOREY_M, rel=0.1)  # ... at their heights
+    assert abs(brain.pose_3d.z_m) < 0.3
+
+
+def test_a_revoked_loop_closure_gives_the_height_of_before_back():
+    brain = brain_3d()
+    for frame in drive([0, 1])[0]:
+        brain(frame)
+    cells = brain.pose_3d
+    before, last = cells.z_m, brain.map.current
+    cells.rises.append(source=last, target=2, rise_m=0.1)  # it would have closed a loop to there
+    cells.now.at, cells.now.rise_m = 2, 0.0
+    cells._undo(Revoked(last, 2, Pose(0.0, 0.0, 0.0)))
+    assert cells.z_m == pytest.approx(cells.levels.array("z_m")[last] + 0.1)
+    assert cells.z_m == pytest.approx(before, abs=0.5)
+    assert not ((cells.measured_rises.source == last) & (cells.measured_rises.target == 2)).any()
+
+
 def test_a_closed_loop_corrects_the_height():
     frames, z = drive([0, 1, 0, 0])
     biased = [frame._replace(v_z_m_s=frame.v_z_m_s + 0.03) for frame in frames]
@@ -311,7 +338,6 @@ def test_a_merge_that_takes_storeys_for_each_other_is_refused_with_the_reason():
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"map": {"closure": "sequence"}}, "set map.closure to 'view'"),
         ({"pose_cells": {"excite_size": 9}, "pose_3d": {"n_z": 7}}, "expected n_z of at least"),
     ],
 )
