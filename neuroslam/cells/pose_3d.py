@@ -466,8 +466,8 @@ class PoseCells3D(Population):
         return {"cells_3d/activity": (grid.sum(axis=0), grid.sum(axis=1), sheet)}
 
     def frame_columns(self) -> dict[str, float]:
-        """Return the height of the robot on the map, and that of the cells."""
-        return {"z_m": self.z_m, "pose_z": self.estimate_3d.z}
+        """Return the height of the robot, that of the cells, and that above the experience."""
+        return {"z_m": self.z_m, "pose_z": self.estimate_3d.z, "rise_m": self.now.rise_m}
 
     def experience_columns(self) -> dict[str, np.ndarray]:
         """Return the height of every experience."""

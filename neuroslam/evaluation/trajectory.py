@@ -55,10 +55,14 @@ class RelativePoseError(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A planar track: times ``(n,)`` in s; x, y in m and heading in rad ``(n, 3)``."""
+    """A track: times ``(n,)`` in s; x, y in m and heading in rad ``(n, 3)``; height in m ``(n,)``.
+
+    Without heights it is in the plane.
+    """
 
     times_s: np.ndarray
     poses: np.ndarray
+    heights_m: np.ndarray | None = None
 
 
 def align(estimate: np.ndarray, truth: np.ndarray, mode: AlignmentMode = "rigid") -> Alignment:
@@ -136,7 +140,7 @@ def absolute_trajectory_error(
     """
     estimate, truth = _as_points(estimate, truth)
     moved = align(estimate, truth, mode).apply(estimate)
-    return _statistics(np.linalg.norm(moved - truth, axis=1))
+    return statistics_of(np.linalg.norm(moved - truth, axis=1))
 
 
 def relative_pose_error(
@@ -174,7 +178,7 @@ def relative_pose_error(
     estimated, true = (relative_poses(poses[:-delta], poses[delta:]) for poses in (estimate, truth))
     error = relative_poses(true, estimated)
     return RelativePoseError(
-        _statistics(np.hypot(error[:, 0], error[:, 1])), _statistics(np.abs(error[:, 2]))
+        statistics_of(np.hypot(error[:, 0], error[:, 1])), statistics_of(np.abs(error[:, 2]))
     )
 
 
@@ -248,10 +252,13 @@ def shape_rmse(a_xy: np.ndarray, b_xy: np.ndarray) -> float:
 def write_tum(path: Path, track: Track) -> None:
     """Write a track as TUM lines ``time x y z qx qy qz qw``: times to 1 ns, positions to 1 nm."""
     half = np.asarray(track.poses)[:, 2] / 2.0
+    heights = ["0"] * len(half)
+    if track.heights_m is not None:
+        heights = [f"{z:.9f}" for z in track.heights_m]
     lines = [
-        f"{time:.9f} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n"
-        for time, (x, y, _), qz, qw in zip(
-            track.times_s, track.poses, np.sin(half), np.cos(half), strict=True
+        f"{time:.9f} {x:.9f} {y:.9f} {z} 0 0 {qz:.12f} {qw:.12f}\n"
+        for time, (x, y, _), z, qz, qw in zip(
+            track.times_s, track.poses, heights, np.sin(half), np.cos(half), strict=True
         )
     ]
     write_atomically(Path(path), lambda file: file.write_text("".join(lines), encoding="ascii"))
@@ -266,7 +273,9 @@ class TumFile(NamedTuple):
 
 
 def read_tum(path: Path) -> Track:
-    """Read TUM lines ``time x y z qx qy qz qw``; height, roll and pitch are ignored.
+    """Read TUM lines ``time x y z qx qy qz qw``; roll and pitch are ignored.
+
+    A file whose z are all 0 is a track in the plane.
 
     Raises:
         SourceError: If the file is missing or a line is invalid; the message has its number.
@@ -274,7 +283,8 @@ def read_tum(path: Path) -> Track:
     t, positions, q = read_tum_file(path)
     (qx, qy, qz, qw), norm = q.T, np.square(q).sum(axis=1)
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy**2 + qz**2))
-    return Track(t, np.column_stack([positions[:, :2], yaw]))
+    heights = positions[:, 2].copy() if positions[:, 2].any() else None
+    return Track(t, np.column_stack([positions[:, :2], yaw]), heights)
 
 
 def read_tum_file(path: Path, on_bad_line: Callable[[str], object] | None = None) -> TumFile:
@@ -361,7 +371,8 @@ def _nearest(of: np.ndarray, among: np.ndarray) -> np.ndarray:
     return np.where(of - among[before] <= among[after] - of, before, after)
 
 
-def _statistics(errors: np.ndarray) -> ErrorStatistics:
+def statistics_of(errors: np.ndarray) -> ErrorStatistics:
+    """Return the statistics of errors, ``(n,)``."""
     return ErrorStatistics(
         rmse=math.sqrt(float(np.mean(np.square(errors)))),
         mean=float(np.mean(errors)),

@@ -11,6 +11,7 @@ from neuroslam.brain import load_brain
 from neuroslam.errors import RunError, counted
 from neuroslam.evaluation.icp import IcpMode, fraction_of_diagonal, map_rmse
 from neuroslam.evaluation.relations import FAR_S, read_relations, relation_errors
+from neuroslam.evaluation.storeys import error_in_3d
 from neuroslam.evaluation.trajectory import (
     AlignmentMode,
     ErrorStatistics,
@@ -18,6 +19,7 @@ from neuroslam.evaluation.trajectory import (
     associate,
     read_tum,
     relative_pose_error,
+    statistics_of,
 )
 from neuroslam.evaluation.trajectory import (
     align as align_tracks,
@@ -33,11 +35,12 @@ _NOTED_SCALE = 1.1
 
 
 class _Pairs(NamedTuple):
-    """Poses of a track and of the truth at the same instants, and the frames of the track."""
+    """Poses of a track and of the truth at the same instants; frames of the track; heights."""
 
     estimate: np.ndarray
     truth: np.ndarray
     n_frames: int
+    heights_m: tuple[np.ndarray, np.ndarray] | None = None  # of both
 
 
 def evaluate(
@@ -66,7 +69,8 @@ def evaluate(
         track_axes: The same of a TUM file of the track.
 
     Returns:
-        Name of the error, its statistics, its unit.
+        Name of the error, its statistics, its unit. The error in x, y and z is there if the track
+        and the truth have heights.
 
     Raises:
         NeuroslamError: If a file is missing or damaged, or there is no truth to compare with.
@@ -75,7 +79,7 @@ def evaluate(
     if align is not None and align not in get_args(AlignmentMode):
         raise RunError(f"--align {align}: expected one of {', '.join(get_args(AlignmentMode))}")
     pairs = _pairs(track, truth, axes, track_axes, note)
-    estimate, reference, n_frames = pairs
+    estimate, reference, n_frames, heights = pairs
     if len(estimate) < 2:
         check = "" if truth is None else f"; is {truth} the truth of this track?"
         raise RunError(
@@ -95,7 +99,21 @@ def evaluate(
         note("the scale is unknown, as one camera measures none; --align similarity frees it")
     elif align is None:
         _note_scale(estimate, reference, absolute, note)
-    return [("absolute (ATE)", absolute, "m"), *_relative(estimate, reference, "m", note)]
+    rows = [("absolute (ATE)", absolute, "m")]
+    if heights is not None and mode == "rigid":
+        rows.append(("absolute in x, y, z", _in_3d(estimate, reference, heights), "m"))
+    return [*rows, *_relative(estimate, reference, "m", note)]
+
+
+def _in_3d(
+    estimate: np.ndarray, reference: np.ndarray, heights_m: tuple[np.ndarray, np.ndarray]
+) -> ErrorStatistics:
+    """Return the absolute error in x, y and z, aligned by a turn about the vertical."""
+    points = (
+        np.column_stack([xy[:, :2], z])
+        for xy, z in zip((estimate, reference), heights_m, strict=True)
+    )
+    return statistics_of(error_in_3d(*points))
 
 
 def _pairs(
@@ -117,7 +135,10 @@ def _pairs(
     if truth is not None:
         true = read_truth(truth, axes, note)
         i, j = associate(found.times_s, true.times_s)
-        return _Pairs(found.poses[i], true.poses[j], len(found.times_s))
+        heights = None
+        if found.heights_m is not None and true.heights_m is not None:
+            heights = found.heights_m[i], true.heights_m[j]
+        return _Pairs(found.poses[i], true.poses[j], len(found.times_s), heights)
     trace = None if out is None else read_trace(out, len(found.times_s))
     true_track = None if trace is None else true_poses(trace)
     if trace is None or true_track is None:

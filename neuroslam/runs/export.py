@@ -1,5 +1,6 @@
 """Export of a map: trajectories, pose graphs, graph files, MCAP and neuromorphic networks."""
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from functools import partial
@@ -12,12 +13,15 @@ from neuroslam.brain import NavigationBrain, load_brain
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.evaluation.trajectory import Track, read_tum, write_tum
 from neuroslam.runs.files import brain_file
+from neuroslam.runs.heights import map_heights, rises_of_links
 from neuroslam.runs.mcap import export_mcap
 from neuroslam.runs.reading import track_file
 from neuroslam.spiking.export import export_nir
 from neuroslam.spiking.path_integrator import PathIntegrator
 from neuroslam.state.files import write_atomically
 from neuroslam.state.sessions import session_name
+
+_UPRIGHT = 10.0  # how much better roll and pitch are known than the heading
 
 
 def export(
@@ -32,13 +36,16 @@ def export(
     - ``tum``: for a run folder its ``trajectory.tum``, one pose per frame; for a brain file the
       poses of its experiences in order of their ids. The time column holds the number of the frame
       that created the experience; where the numbers of another session start again from a lower
-      one, the column counts on, because times must rise.
+      one, the column counts on, because times must rise. The column z has heights where the brain
+      measures them.
     - ``g2o``: a ``VERTEX_SE2`` for each experience, an ``EDGE_SE2`` for each link with its
       measurement :math:`(d \cos h,\; d \sin h,\; f)` of distance, heading and facing, and the
       information matrix :math:`\mathrm{diag}(\sigma_m^{-2}, \sigma_m^{-2}, \sigma_{rad}^{-2})`
-      of the config; vertex 0 is fixed, in the last line.
+      of the config; vertex 0 is fixed, in the last line. Of a brain that measures heights
+      ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``, with the rise of each link; gravity fixes roll and
+      pitch, to :math:`\sigma_{rad} / 10`.
     - ``graphml``: a node for each experience with its pose, its view and its origin, a directed
-      edge for each link with its measurements.
+      edge for each link with its measurements; with heights ``z_m`` and ``rise_m``.
     - ``nir``: the spiking path integrator of a brain with semantic cells whose tier is ``spiking``
       (:func:`neuroslam.spiking.export.export_nir`, extra ``spiking-export``).
     - ``mcap``: a run folder with Foxglove's schemas: pictures, poses, path, graph and activity of
@@ -102,7 +109,7 @@ def _write_tum(brain: NavigationBrain, to: Path) -> None:
     steps = np.diff(frames)
     steps[steps <= 0] = 1
     times = frames[0] + np.concatenate([[0], np.cumsum(steps)])
-    write_tum(to, Track(times.astype(np.float64), brain.map.poses))
+    write_tum(to, Track(times.astype(np.float64), brain.map.poses, map_heights(brain)))
 
 
 def _write_g2o(brain: NavigationBrain, to: Path) -> None:
@@ -114,6 +121,10 @@ def _write_g2o(brain: NavigationBrain, to: Path) -> None:
         links.distance_m * np.cos(links.heading_rad),
         links.distance_m * np.sin(links.heading_rad),
     )
+    heights = map_heights(brain)
+    if heights is not None:
+        _write_g2o_3d(brain, heights, np.column_stack([dx, dy]), to)
+        return
     columns = (links.source, links.target, dx, dy, links.facing_rad)
     lines += [
         f"EDGE_SE2 {i} {j} {x!r} {y!r} {facing!r} {position!r} 0 0 {position!r} 0 {turn!r}"
@@ -121,6 +132,33 @@ def _write_g2o(brain: NavigationBrain, to: Path) -> None:
     ]
     lines.append("FIX 0")  # last: some readers stop at it
     text = "\n".join(lines) + "\n"
+    write_atomically(to, lambda file: file.write_text(text, encoding="ascii"))
+
+
+def _write_g2o_3d(
+    brain: NavigationBrain, heights_m: np.ndarray, moved_m: np.ndarray, to: Path
+) -> None:
+    """Write the graph in x, y, z and heading, as poses of three dimensions that stand upright."""
+    links, config = brain.map.links, brain.config.map
+    lines = [
+        f"VERTEX_SE3:QUAT {i} {x!r} {y!r} {z!r} 0 0 {math.sin(theta / 2)!r} {math.cos(theta / 2)!r}"
+        for i, ((x, y, theta), z) in enumerate(
+            zip(brain.map.poses.tolist(), heights_m.tolist(), strict=True)
+        )
+    ]
+    position, turn = config.sigma_m**-2, config.sigma_rad**-2
+    upright = (config.sigma_rad / _UPRIGHT) ** -2
+    diagonal = (position, position, position, upright, upright, turn)
+    information = " ".join(
+        repr(diagonal[i]) if i == j else "0" for i in range(6) for j in range(i, 6)
+    )
+    columns = (links.source, links.target, *moved_m.T, rises_of_links(brain, heights_m))
+    for i, j, x, y, z, facing in zip(
+        *(c.tolist() for c in (*columns, links.facing_rad)), strict=True
+    ):
+        turned = f"0 0 {math.sin(facing / 2)!r} {math.cos(facing / 2)!r}"
+        lines.append(f"EDGE_SE3:QUAT {i} {j} {x!r} {y!r} {z!r} {turned} {information}")
+    text = "\n".join([*lines, "FIX 0"]) + "\n"
     write_atomically(to, lambda file: file.write_text(text, encoding="ascii"))
 
 
@@ -138,6 +176,10 @@ def _write_graphml(brain: NavigationBrain, to: Path) -> None:
     }
     names = ("distance_m", "heading_rad", "facing_rad", "duration_s")
     edges = {name: getattr(links, name).tolist() for name in names}
+    heights = map_heights(brain)
+    if heights is not None:
+        nodes["z_m"] = heights.tolist()
+        edges["rise_m"] = rises_of_links(brain, heights).tolist()
     root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
     types = {int: "long", float: "double", str: "string"}
     for what, columns in (("node", nodes), ("edge", edges)):

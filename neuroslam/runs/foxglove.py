@@ -8,7 +8,7 @@ every number lies at a multiple of its size, counted from the end of a header of
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -196,8 +196,8 @@ def stamp_of(time_s: float) -> dict[str, int]:
     return {"sec": min(max(whole, -(2**31)), 2**31 - 1), "nanosec": fraction}
 
 
-def pose_of(pose: Pose) -> dict[str, Any]:
-    """Return a pose of the plane as position and quaternion.
+def pose_of(pose: Pose, z_m: float = 0.0) -> dict[str, Any]:
+    """Return an upright pose as position and quaternion.
 
     Example:
         >>> pose_of(Pose(1.0, 2.0, 0.0))["orientation"]
@@ -205,7 +205,7 @@ def pose_of(pose: Pose) -> dict[str, Any]:
     """
     half = 0.5 * pose.theta_rad
     return {
-        "position": {"x": float(pose.x_m), "y": float(pose.y_m), "z": 0.0},
+        "position": {"x": float(pose.x_m), "y": float(pose.y_m), "z": float(z_m)},
         "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
     }
 
@@ -239,14 +239,18 @@ def activity_of(layer: np.ndarray, stamp: dict[str, int]) -> dict[str, Any]:
     return {"timestamp": stamp, "frame_id": "cells", "format": "png", "data": data}
 
 
-def graph_of(poses: np.ndarray, links: Links, stamp: dict[str, int]) -> dict[str, Any]:
+def graph_of(
+    poses: np.ndarray, links: Links, stamp: dict[str, int], heights_m: np.ndarray | None = None
+) -> dict[str, Any]:
     """Return experiences and links as a scene: a list of lines, and a sphere each experience.
 
     Args:
         poses: Of the experiences, ``(n, 3)``.
         links: Between them.
         stamp: The time.
+        heights_m: Of the experiences, ``(n,)``; ``None``: 0.
     """
+    z = np.zeros(len(poses)) if heights_m is None else heights_m
     ends = np.column_stack([links.source, links.target]).reshape(-1)
     size = 0.3 * max(link_length(links), 1e-3)
     lines = {
@@ -254,16 +258,19 @@ def graph_of(poses: np.ndarray, links: Links, stamp: dict[str, int]) -> dict[str
         "pose": pose_of(Pose(0.0, 0.0, 0.0)),
         "thickness": 1.5,
         "scale_invariant": True,
-        "points": [{"x": x, "y": y} for x, y in poses[ends, :2].tolist()],
+        "points": [
+            {"x": x, "y": y, "z": up}
+            for (x, y), up in zip(poses[ends, :2].tolist(), z[ends].tolist(), strict=True)
+        ],
         "color": {"r": 0.12, "g": 0.47, "b": 0.71, "a": 1.0},
     }
     spheres = [
         {
-            "pose": pose_of(Pose(*row)),
+            "pose": pose_of(Pose(*row), up),
             "size": {"x": size, "y": size, "z": size},
             "color": {"r": 0.9, "g": 0.45, "b": 0.1, "a": 1.0},
         }
-        for row in poses.tolist()
+        for row, up in zip(poses.tolist(), z.tolist(), strict=True)
     ]
     entity = {
         "timestamp": stamp,
@@ -275,9 +282,12 @@ def graph_of(poses: np.ndarray, links: Links, stamp: dict[str, int]) -> dict[str
     return {"entities": [entity]}
 
 
-def path_of(poses: Iterable[Iterable[float]], stamp: dict[str, int]) -> dict[str, Any]:
-    """Return poses, ``(n, 3)``, as a path."""
-    track = [pose_of(Pose(*row)) for row in poses]
+def path_of(
+    poses: np.ndarray, stamp: dict[str, int], heights_m: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Return poses, ``(n, 3)``, with their heights if they are known, as a path."""
+    z = np.zeros(len(poses)) if heights_m is None else heights_m
+    track = [pose_of(Pose(*row), up) for row, up in zip(poses.tolist(), z.tolist(), strict=True)]
     return {"timestamp": stamp, "frame_id": FRAME_ID, "poses": track}
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from neuroslam.brain import load_brain
 from neuroslam.errors import ConfigError, RunError, SourceError
 from neuroslam.geometry import compose_poses
-from neuroslam.runs.files import brain_file
+from neuroslam.runs.files import brain_file, more_columns
 from neuroslam.runs.foxglove import (
     FRAME_ID,
     activity_of,
@@ -38,6 +38,7 @@ from neuroslam.runs.foxglove import (
     stamp_of,
     to_cdr,
 )
+from neuroslam.runs.heights import frame_heights, map_heights
 from neuroslam.runs.reading import read_actions, read_frames, read_plan, read_trace, trajectory
 from neuroslam.runs.recording import Recorder
 from neuroslam.sensors import open_source
@@ -103,9 +104,10 @@ class McapFile:
         data = to_cdr(TOPICS[topic], message)
         self._writer.add_message(self._channels[topic], at_ns, data, at_ns)
 
-    def write_pose(self, time_s: float, pose: Pose) -> None:
+    def write_pose(self, time_s: float, pose: Pose, z_m: float = 0.0) -> None:
         """Append a pose on the map."""
-        message = {"timestamp": stamp_of(time_s), "frame_id": FRAME_ID, "pose": pose_of(pose)}
+        there = pose_of(pose, z_m)
+        message = {"timestamp": stamp_of(time_s), "frame_id": FRAME_ID, "pose": there}
         self.write("/pose", time_s, message)
 
     def close(self) -> None:
@@ -134,7 +136,7 @@ class McapRecorder(Recorder):
     def __init__(self, path: Path) -> None:
         self._file = McapFile(path)
         self._seen, self._graph_due = 0, FIRST_GRAPH
-        self._steps: list[tuple[int, Pose]] = []
+        self._steps: list[tuple[int, tuple[float, ...]]] = []  # x, y, heading, and above it
         self._last: tuple[float, NavigationBrain] | None = None
         self._closed = False
 
@@ -144,7 +146,8 @@ class McapRecorder(Recorder):
         stamp = stamp_of(time_s)
         if frame.image is not None:
             self._file.write("/camera", time_s, picture_of(frame.image, stamp, "camera"))
-        self._file.write_pose(time_s, result.pose)
+        up = more_columns(brain)
+        self._file.write_pose(time_s, result.pose, up.get("z_m", 0.0))
         status = {
             "timestamp": stamp,
             "frame": result.frame,
@@ -159,11 +162,12 @@ class McapRecorder(Recorder):
             self._file.write("/cells", time_s, activity_of(layer, stamp))
         self._seen += 1
         if result.experience != NO_EXPERIENCE:
-            self._steps.append((result.experience, brain.map.offset))
+            offset = (*brain.map.offset, up.get("rise_m", 0.0))
+            self._steps.append((result.experience, offset))
         self._last = time_s, brain
         if self._seen >= self._graph_due:
             self._graph_due *= 2
-            graph = graph_of(brain.map.poses, brain.map.links, stamp)
+            graph = graph_of(brain.map.poses, brain.map.links, stamp, map_heights(brain))
             self._file.write("/graph", time_s, graph)
 
     def close(self) -> None:
@@ -174,13 +178,16 @@ class McapRecorder(Recorder):
         if self._last is not None:
             time_s, brain = self._last
             stamp, poses = stamp_of(time_s), brain.map.poses
-            self._file.write("/graph", time_s, graph_of(poses, brain.map.links, stamp))
+            heights = map_heights(brain)
+            self._file.write("/graph", time_s, graph_of(poses, brain.map.links, stamp, heights))
             known = [(e, offset) for e, offset in self._steps if e < len(poses)]
-            path = np.empty((0, 3))
+            path, up = np.empty((0, 3)), None
             if known:
                 ids, offsets = zip(*known, strict=True)
-                path = compose_poses(poses[list(ids)], np.array(offsets))
-            self._file.write("/path", time_s, path_of(path.tolist(), stamp))
+                path = compose_poses(poses[list(ids)], np.array(offsets)[:, :3])
+                if heights is not None:
+                    up = heights[list(ids)] + np.array(offsets)[:, 3]
+            self._file.write("/path", time_s, path_of(path, stamp, up))
         self._file.close()
 
 
@@ -210,7 +217,7 @@ def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = Non
     rows = brain.clock.frames_seen
     frames, actions, trace = read_frames(run, rows), read_actions(run, rows), read_trace(run, rows)
     brain = brain.largest
-    poses = trajectory(brain, trace)
+    poses, up = trajectory(brain, trace), frame_heights(brain, trace, run)
     known = [all(map(math.isfinite, pose)) for pose in poses.tolist()]
     times_s = frames["time_s"]
     notes: list[str] = []
@@ -218,9 +225,10 @@ def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = Non
     def write(path: Path) -> None:
         with McapFile(path) as file:
             begin = stamp_of(float(times_s[0]))
-            graph = graph_of(brain.map.poses, brain.map.links, begin)
+            graph = graph_of(brain.map.poses, brain.map.links, begin, map_heights(brain))
             file.write("/graph", float(times_s[0]), graph)
-            file.write("/path", float(times_s[0]), path_of(poses[known].tolist(), begin))
+            driven = path_of(poses[known], begin, None if up is None else up[known])
+            file.write("/path", float(times_s[0]), driven)
             pictures = _pictures(run, brain, source, notes)
             cells = _cells(run, brain, float(times_s[-1]))
             picture, sample = next(pictures, None), next(cells, None)
@@ -232,7 +240,8 @@ def export_mcap(run: str | Path, to: str | Path, source: str | Path | None = Non
                 if picture is not None and picture[0] == number:
                     file.write("/camera", time_s, picture_of(picture[1], stamp, "camera"))
                 if known[i]:
-                    file.write_pose(time_s, Pose(*poses[i].tolist()))
+                    z_m = 0.0 if up is None else float(up[i])
+                    file.write_pose(time_s, Pose(*poses[i].tolist()), z_m)
                 status = {
                     "timestamp": stamp,
                     "frame": number,

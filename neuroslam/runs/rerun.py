@@ -26,7 +26,9 @@ import numpy as np
 from neuroslam.errors import ConfigError, RunError
 from neuroslam.figures.views import template_picture
 from neuroslam.mapping.tables import closes_loop
+from neuroslam.runs.files import more_columns
 from neuroslam.runs.foxglove import jpeg, link_length
+from neuroslam.runs.heights import map_heights
 from neuroslam.runs.recording import Recorder, coloured
 from neuroslam.state.answers import gathered, pictures_of
 from neuroslam.types import Frame, StepResult
@@ -112,7 +114,8 @@ class RerunRecorder(Recorder):
         self._links, self._experiences = result.n_links, max(result.n_experiences, 1)
         error = view.error if view.error >= 0.0 else np.nan
         counts = result.n_templates, result.n_experiences, self._closures
-        self._rows.append((result.frame, result.time_s, *result.pose, error, *counts))
+        up = more_columns(brain).get("z_m", 0.0)
+        self._rows.append((result.frame, result.time_s, *result.pose, up, error, *counts))
         self._last = result, frame, brain
         self._seen += 1
         if self._seen >= self._due or len(self._rows) >= _ROWS:
@@ -137,18 +140,18 @@ class RerunRecorder(Recorder):
         rr, stream = self._rr, self._stream
         rows = np.array(self._rows, np.float64)
         self._rows = []
-        self._track += rows[:, 2:4].tolist()
+        self._track += rows[:, [2, 3, 5]].tolist()
         key = "timestamp" if abs(rows[0, 1]) > _UNIX_S else "duration"
         times = [
             rr.TimeColumn("frame", sequence=rows[:, 0].astype(np.int64)),
             rr.TimeColumn("time", **{key: rows[:, 1]}),
         ]
-        x, y, heading = rows[:, 2:5].T
+        x, y, heading, up = rows[:, 2:6].T
         flat = np.zeros(len(rows))
         ahead = self._arrow_m * np.column_stack([np.cos(heading), np.sin(heading), flat])
-        robot = rr.Arrows3D.columns(origins=np.column_stack([x, y, flat]), vectors=ahead)
+        robot = rr.Arrows3D.columns(origins=np.column_stack([x, y, up]), vectors=ahead)
         stream.send_columns("map/robot", times, robot)
-        for name, values in zip(_FIGURES, rows[:, 5:].T, strict=True):
+        for name, values in zip(_FIGURES, rows[:, 6:].T, strict=True):
             stream.send_columns(f"figures/{name}", times, rr.Scalars.columns(scalars=values))
         for number, time_s, experience in self._closed_now:
             stream.set_time("frame", sequence=number)
@@ -177,7 +180,9 @@ class RerunRecorder(Recorder):
         rr, stream = self._rr, self._stream
         self._at(result)
         poses, links = brain.map.poses, brain.map.links
-        points = np.column_stack([poses[:, :2], np.zeros(len(poses))])
+        heights = map_heights(brain)
+        up = np.zeros(len(poses)) if heights is None else heights
+        points = np.column_stack([poses[:, :2], up])
         size = 0.2 * link_length(links)
         ends = np.stack([points[links.source], points[links.target]], axis=1)
         closing = closes_loop(links.source, links.target)
@@ -188,8 +193,7 @@ class RerunRecorder(Recorder):
             strips = rr.LineStrips3D(chosen, colors=[colour], radii=[0.3 * size])
             stream.log(f"map/{name}", strips)
         stream.log("map/experiences", rr.Points3D(points, colors=[_NODES], radii=[size]))
-        track = np.array(self._track, np.float64).reshape(-1, 2)
-        path = np.column_stack([track, np.full(len(track), -size)])  # below the map
+        path = np.array(self._track, np.float64).reshape(-1, 3) - (0.0, 0.0, size)  # below the map
         stream.log("map/path", rr.LineStrips3D([path], colors=[_PATH], radii=[0.2 * size]))
 
     def close(self) -> None:

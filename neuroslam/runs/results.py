@@ -21,6 +21,7 @@ from neuroslam.runs.files import (
     run_files,
     write_text,
 )
+from neuroslam.runs.heights import frame_heights
 from neuroslam.runs.manifest import ROWS, Extent, extent_of, write_manifest
 from neuroslam.runs.plot import draw_map
 from neuroslam.runs.reading import (
@@ -187,7 +188,9 @@ def write_results(
     write_text(staged / "links.csv", links_csv(shown.map.links, shown.map.link_weights))
     for name, table in tables.items():
         write_text(staged / name, table)
-    write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map]))
+    z_m = frame_heights(shown, trace, save.rows_in)
+    heights = None if z_m is None else z_m[on_map]
+    write_tum(staged / "trajectory.tum", Track(trace["time_s"][on_map], track[on_map], heights))
     draw_map(brain, plan, trace, staged / "map.png", unit_of(summary.measured))
     save.ended = True
     save(brain, plan, summary)

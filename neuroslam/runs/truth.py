@@ -77,7 +77,9 @@ def read_truth(
         note(lost_rows(f"truth {path}", faults, n_rows))
     if axes is None and (found := axes_note(f"truth {path}", positions, option)):
         note(found)
-    return Track(times_s, poses)
+    up = positions[:, 2]
+    known = span == ROBOT and np.isfinite(up).all() and up.any()
+    return Track(times_s, poses, up if known else None)
 
 
 def _from_csv(

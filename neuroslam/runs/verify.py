@@ -16,6 +16,7 @@ from neuroslam.runs.files import (
     links_csv,
     missing_rows,
 )
+from neuroslam.runs.heights import frame_heights
 from neuroslam.runs.manifest import manifest_faults, read_manifest
 from neuroslam.runs.reading import frame_rows, read_metrics, read_plan, read_trace, trajectory
 from neuroslam.state.answers import gathered, tables_of
@@ -96,7 +97,8 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
             f"{counted(seen, 'frame')}; the run was cut off: resume it"
         )
     try:
-        poses = trajectory(shown, read_trace(out, seen))
+        trace = read_trace(out, seen)
+        poses = trajectory(shown, trace)
         on_map = np.isfinite(poses[:, 0])
         if not on_map.any():
             return  # all frames are on maps that were not joined
@@ -109,7 +111,12 @@ def _folder_faults(out: Path, brain: NavigationBrain) -> Iterator[str]:
         return
     apart = track.poses - poses[on_map]
     apart[:, 2] = wrap_angles(apart[:, 2])
-    wrong = np.flatnonzero((np.abs(apart) > 1e-6).any(1))
+    far = (np.abs(apart) > 1e-6).any(1)
+    z_m = frame_heights(shown, trace, out)
+    if z_m is not None:
+        there = 0.0 if track.heights_m is None else track.heights_m
+        far |= np.abs(there - z_m[on_map]) > 1e-6
+    wrong = np.flatnonzero(far)
     if len(wrong):
         yield f"{out / 'trajectory.tum'}: poses {listed(wrong)} differ from the brain"
 

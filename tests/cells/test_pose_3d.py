@@ -265,7 +265,7 @@ def test_new_columns_come_after_the_others():
     lines = experiences_csv(brain).splitlines()
     assert lines[0] == "id,x_m,y_m,theta_rad,template,first_frame,z_m"
     assert float(lines[-1].split(",")[-1]) == brain.pose_3d.experience_heights_m[-1]
-    assert list(more_columns(brain)) == ["z_m", "pose_z"]
+    assert list(more_columns(brain)) == ["z_m", "pose_z", "rise_m"]
     assert more_columns(NavigationBrain()) == {}
 
 
