@@ -31,7 +31,7 @@ from neuroslam.cells.yaw_height import YawHeightCells
 from neuroslam.config import BrainConfig, MapConfig, PoseCellConfig, Section
 from neuroslam.config.bounds import MOST_CELLS
 from neuroslam.errors import ConfigError, MapError
-from neuroslam.geometry import TWO_PI
+from neuroslam.geometry import TWO_PI, wrap_angle
 from neuroslam.mapping.heights import Rises, contract_rises, relax_heights
 from neuroslam.state.join import Join, MovedCells
 from neuroslam.state.match import Match, Pairs
@@ -55,11 +55,16 @@ from neuroslam.types import (
     Motion,
     PoseEstimate,
     Revoked,
+    Tracking,
     ViewMatch,
 )
 
 _SETTLING = 0.05
 """Share of its distance in height by which a tracked robot settles at each experience it passes."""
+
+
+_TURNED_AWAY = 0.6
+"""Heading, rad, from which a tracked robot is not at an experience."""
 
 
 class Pose3DConfig(Section):
@@ -100,6 +105,23 @@ class _Now(Scalars):
     at: int
     at_rest: int
     injected: int
+
+
+def _settled(
+    map_: LeadableMap, motion: Motion, view: ViewMatch, tracking: Tracking
+) -> tuple[Tracking, ViewMatch]:
+    """Return how a tracked robot arrives at an experience: it settles at its heading by and by.
+
+    Where it has turned away from the heading there, as at the foot of a ramp, it stays at the last
+    experience, so that odometry goes on from there when the known places have been left.
+    """
+    there = map_.pose_table[tracking.experience, 2]
+    heading = map_.pose.theta_rad + motion.w_rad_s * motion.dt_s
+    apart = wrap_angle(heading - there - view.relative_heading_rad)
+    if abs(apart) > _TURNED_AWAY:
+        return tracking._replace(experience=map_.current), view
+    turned = view.relative_heading_rad + (1.0 - _SETTLING) * apart
+    return tracking, view._replace(relative_heading_rad=turned)
 
 
 @register("pose_3d")
@@ -415,9 +437,12 @@ class PoseCells3D(Population):
         if tracking is not None and tracking.revoked is not None:
             before = tracking.revoked.source
             self._undo(tracking.revoked)
+        view = now.view
+        if tracking is not None and tracking.kind == "at":
+            tracking, view = _settled(map_, now.motion, view, tracking)
         decision = Decision(
             *map_(
-                now.motion, now.view, self.estimate, now.frame,
+                now.motion, view, self.estimate, now.frame,
                 kidnapped=now.vetoed, tracking=tracking,
             )
         )  # fmt: skip
