@@ -22,6 +22,7 @@ from neuroslam.runs.files import experiences_csv, more_columns
 from neuroslam.state.match import Match, Pairs
 from neuroslam.state.population import Correction
 from neuroslam.types import Frame, Motion, Pose, Revoked, Velocity, ViewMatch
+from neuroslam.worlds.world import open_world
 
 EXACT = PoseCellConfig(precision="float64", cell_size_m=0.5)
 SPEEDS = st.floats(-1.0, 1.0)
@@ -292,6 +293,18 @@ def test_forgotten_experiences_keep_the_heights_of_the_rest():
         heights[rises.target] - heights[rises.source], rises.rise_m, atol=0.4
     )
     assert faults_of(brain.state_dict(), brain) == []
+
+
+def test_heights_landmarks_and_head_direction_are_in_one_brain():
+    source = open_world("world:garage?markers=12&landmark_reach=6&start=0.17&noise=0.05")
+    alone, together = brain_3d(), brain_3d(cells=["pose_3d", "semantic", "head_direction"])
+    for i in range(40):
+        alone(source.frame(i))
+        together(source.frame(i))
+    assert together.leader is together.pose_3d
+    assert together.pose_3d.z_m == alone.pose_3d.z_m > 0.3
+    assert together.semantic.counts()["landmarks"] > 0
+    assert faults_of(together.state_dict(), together) == []
 
 
 # --- two sessions ----------------------------------------------------------------------------
