@@ -296,7 +296,7 @@ def test_forgotten_experiences_keep_the_heights_of_the_rest():
 
 
 def test_heights_landmarks_and_head_direction_are_in_one_brain():
-    source = open_world("world:garage?markers=12&landmark_reach=6&start=0.17&noise=0.05")
+    source = open_world("world:garage?markers=12&landmark_reach=6&start=0.19&noise=0.05")
     alone, together = brain_3d(), brain_3d(cells=["pose_3d", "semantic", "head_direction"])
     for i in range(40):
         alone(source.frame(i))
