@@ -606,6 +606,14 @@ class SessionConfig(Section):
         description="share of right merges that the test of the residuals refuses; larger: more "
         "merges are refused",
     )
+    coincidence: float = Field(
+        default=0.01,
+        gt=0,
+        le=1,
+        description="largest probability, in a merge of finished maps, that the matched places are "
+        "others that look the same; smaller: maps must share more places, and repeat less; 1: not "
+        "tested",
+    )
     check_residuals: bool = Field(
         default=True,
         description="refuse a merge whose views are not distinct, whose path does not turn, or "

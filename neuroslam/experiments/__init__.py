@@ -47,6 +47,7 @@ EXPERIMENTS = {
     "lost-compass": ("neuroslam.experiments.lost_compass", "lost_compass", None),
     "three-dimensions": ("neuroslam.experiments.three_dimensions", "three_dimensions", None),
     "same-places": ("neuroslam.experiments.same_places", "same_places", None),
+    "alike-pairs": ("neuroslam.experiments.alike_pairs", "alike_pairs", None),
     "grid-scores": ("neuroslam.experiments.grid_cells", "grid_scores", "rodent"),
     "grid-comparison": ("neuroslam.experiments.grid_comparison", "grid_comparison", "rodent"),
     "grid-learning": ("neuroslam.experiments.grid_learning", "grid_learning", "rodent"),

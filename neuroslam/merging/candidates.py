@@ -56,9 +56,9 @@ class _Side:
 
     def __init__(self, queries: Mapped, memory: Mapped, far_m: float) -> None:
         self.queries, self.memory, self.far_m = queries.view, memory.view, far_m
+        self.other = memory
         self.xy_m = queries.map.poses[:, :2]
         self.templates = queries.map.experiences["template"].numpy()
-        self.of_memory = memory.map.experiences["template"].numpy()
         self.repeated = _repeated(self.templates, self.xy_m, far_m)
         self._rows: dict[int, np.ndarray] = {}
 
@@ -72,17 +72,29 @@ class _Side:
     def errors(self, view: int) -> np.ndarray:
         """Return the match errors of a view with all experiences of the other map."""
         if view not in self._rows:
-            known = self.of_memory != NO_TEMPLATE
-            used, place = np.unique(self.of_memory[known], return_inverse=True)
-            row = np.full(len(known), np.inf)
-            row[known] = self.memory.differences(self.queries.stored_view(view), used)[place]
-            self._rows[view] = row
+            self._rows[view] = view_errors(self.other, self.queries.stored_view(view))
         return self._rows[view]
 
     def away_from(self, experience: int) -> np.ndarray:
         """Return which experiences of this map are elsewhere."""
         away: np.ndarray = np.linalg.norm(self.xy_m - self.xy_m[experience], axis=1) > self.far_m
         return away
+
+
+def view_errors(of: Mapped, view: np.ndarray) -> np.ndarray:
+    """Return the match errors of a view with all experiences of a map; infinite without views.
+
+    Args:
+        of: The map.
+        view: A view, as :meth:`~neuroslam.view.templates.LocalViewCells.stored_view` returns it.
+    """
+    templates = of.map.experiences["template"].numpy()
+    known = templates != NO_TEMPLATE
+    used, place = np.unique(templates[known], return_inverse=True)
+    row = np.full(len(known), np.inf)
+    if len(used):
+        row[known] = of.view.differences(view, used)[place]
+    return row
 
 
 def find_candidates(loaded: Mapped, partial: Mapped) -> Candidates:

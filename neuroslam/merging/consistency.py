@@ -31,6 +31,7 @@ from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.mapping.overlap import n_places
 from neuroslam.mapping.tables import Links
+from neuroslam.merging.distinctness import CHANCE, Distinctness, distinctness
 from neuroslam.merging.mapped import Mapped
 from neuroslam.state.match import Pairs
 from neuroslam.types import Pose
@@ -38,11 +39,12 @@ from neuroslam.types import Pose
 PRIOR_FREEDOM = 12
 """Weight of the prior noise of odometry, in degrees of freedom."""
 
-COLLAPSED = 100.0
-"""Cost of a degree of freedom above which a map contradicts its own odometry: 10 sigma."""
+COLLAPSED = 64.0
+"""Cost of a degree of freedom above which a map contradicts its own odometry: 8 sigma."""
 
 MANY_LOOPS = 0.1
-"""Loops of an experience from which that is more than a single wrong loop."""
+"""Loops of an experience from which that is more than a single wrong loop: such a map has
+collapsed. Fewer are counted as places that look alike."""
 
 VIEW_SIGMA_RAD = math.radians(10.0)
 """Standard deviation of the heading at which a view is recognised."""
@@ -52,9 +54,6 @@ LEAST_TURN_DEG = 45.0
 
 LEAST_SHARE = 1.0 / 6.0
 """Share of the experiences on the common path that must match: else they look different."""
-
-LEAST_SHARE_BEYOND = 0.25
-"""The same if fewer than ``sessions.confirm`` pairs are within ``view.threshold``."""
 
 SAME_HEADING_RAD = math.radians(20.0)
 """Largest difference of heading on a common path."""
@@ -167,6 +166,32 @@ def _own_cost(of: ExperienceMap, sigmas: tuple[np.ndarray, np.ndarray]) -> float
     return report.cost
 
 
+def solve_alone(of: ExperienceMap, config: BrainConfig) -> tuple[np.ndarray, int]:
+    """Solve a map without the loop closures that its odometry contradicts.
+
+    Args:
+        of: The map; it is not altered.
+        config: Its config.
+
+    Returns:
+        Poses, ``(n, 3)``, and the number of loop closures that were left out.
+    """
+    if not of.n_links:
+        return of.poses, 0
+    links = of.links
+    loops = np.abs(links.target - links.source) != 1
+    sigma_m, sigma_rad = link_sigmas(links, config.sessions.residual_factor)
+    solved, report = solve_pose_graph(
+        of.poses,
+        *links[:5],
+        sigma_m=sigma_m,
+        sigma_rad=sigma_rad,
+        rejectable=loops,
+        max_iterations=ITERATIONS,
+    )
+    return solved, int((report.weights[loops] == 0.0).sum())
+
+
 def _joined(
     loaded: ExperienceMap, partial: ExperienceMap, pairs: Pairs
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray]]:
@@ -201,9 +226,11 @@ def weakness(loaded: Mapped, partial: Mapped, pairs: Pairs, result: Consistency)
     """
     confirm = partial.config.sessions.confirm
     maps = ("first", loaded.map), ("second", partial.map)
+    contradicted = 0
     for (name, one), cost in zip(maps, result.own, strict=True):
-        many = one.n_links - one.n + 1 >= MANY_LOOPS * one.n
-        if many and cost > COLLAPSED:
+        loops = one.n_links - one.n + 1
+        contradicted += solve_alone(one, partial.config)[1] if cost > COLLAPSED else 0
+        if loops >= MANY_LOOPS * one.n and cost > COLLAPSED:
             return (
                 f"the loop closures of the {name} map contradict its odometry, with a residual of "
                 f"{math.sqrt(cost):.0f} standard deviations: its views match at several places; "
@@ -234,14 +261,36 @@ def weakness(loaded: Mapped, partial: Mapped, pairs: Pairs, result: Consistency)
     on_path = common_path(result, partial.config) | np.isin(np.arange(partial.map.n), kept.partial)
     share = len(np.unique(kept.partial)) / int(on_path.sum())
     within = n_places(kept.pick(kept.error <= partial.config.view.threshold))
-    least = LEAST_SHARE if within >= confirm else LEAST_SHARE_BEYOND
-    if share < least:
+    if share < LEAST_SHARE:
         return (
             f"{share:.0%} of the {int(on_path.sum())} experiences on the common path match by "
-            f"view, {within} of them within view.threshold; expected {least:.0%}: the paths have "
-            "one shape, but look different; drive more of the common path in both sessions"
+            f"view, {within} of them within view.threshold; expected {LEAST_SHARE:.0%}: the paths "
+            "have one shape, but look different; drive more of the common path in both sessions"
         )
+    if partial.config.sessions.coincidence < 1.0:
+        solved = result.loaded, result.partial
+        found = distinctness(loaded, partial, solved, kept, contradicted)
+        if found.coincidence > partial.config.sessions.coincidence:
+            return _not_distinct(found, partial.config)
     return inconsistency(result)
+
+
+def _not_distinct(found: Distinctness, config: BrainConfig) -> str:
+    """Return why matched places may be others that look the same, and what helps."""
+    few = found.alike < CHANCE * found.places + 1.0
+    cause = (
+        "too few places are known to say how rare such views are; drive more of the common path, "
+        "and of other places, in both sessions"
+        if few
+        else f"{found.alike:.0f} of {counted(found.places, 'place')} look like another one, the "
+        "building repeats itself; if the maps are known to be of one building, and to meet where "
+        "it does not repeat, raise --set sessions.coincidence"
+    )
+    return (
+        f"{counted(found.matched, 'place')} matched by view, but with a probability of "
+        f"{found.coincidence:.1%} they are others that look the same; expected at most "
+        f"{config.sessions.coincidence:.1%}: {cause}"
+    )
 
 
 def count_views(loaded: ExperienceMap, partial: ExperienceMap, pairs: Pairs) -> int:

@@ -8,9 +8,10 @@ import numpy as np
 from neuroslam.errors import counted
 from neuroslam.mapping.experience import ExperienceMap
 from neuroslam.mapping.joining import links_kept
-from neuroslam.merging.consistency import check_consistency, inconsistency
+from neuroslam.merging.consistency import COLLAPSED, check_consistency, inconsistency
 from neuroslam.merging.mapped import SAME_CONFIG, Mapped, differing
 from neuroslam.merging.report import MergeReport
+from neuroslam.merging.shape import misshapen
 from neuroslam.merging.states import merge_states, part_of
 from neuroslam.state.join import Join
 from neuroslam.state.match import Match
@@ -40,7 +41,8 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
 
     If the matched pairs raise the residuals of the links by more than the noise of odometry can
     explain, the matched experiences were not the same, and the merge is refused; see
-    :mod:`neuroslam.merging.consistency`.
+    :mod:`neuroslam.merging.consistency`. It is also refused if the common path has another shape on
+    the two maps; see :mod:`neuroslam.merging.shape`.
 
     Args:
         loaded: The brain that is merged into; its ids stay.
@@ -72,9 +74,12 @@ def merge(loaded: Mapped, partial: Mapped, match: Match) -> Merged:
     _describe(report, loaded, partial, merged, match, join)
     _describe_residuals(report, loaded.map, partial, merged, join)
     if partial.config.sessions.check_residuals and partial.leader.relaxes_map:
-        report.reason = inconsistency(
-            check_consistency(loaded.map, partial.map, match.pairs, partial.config, robust=False)
+        result = check_consistency(
+            loaded.map, partial.map, match.pairs, partial.config, robust=False
         )
+        report.reason = inconsistency(result)
+        if not report.reason and max(result.own) <= COLLAPSED:
+            report.reason = misshapen(loaded.map, partial.map, match.pairs, partial.config)
         if report.reason:
             return Merged(None, join, report)
     for name, population in partial.parts().items():

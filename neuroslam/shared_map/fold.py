@@ -27,14 +27,14 @@ import torch
 from neuroslam.brain import NavigationBrain
 from neuroslam.config import BrainConfig
 from neuroslam.errors import MapError, SharedMapError, counted
-from neuroslam.geometry import compose_poses, rotate_points, wrap_angles
+from neuroslam.geometry import compose_poses, wrap_angles
 from neuroslam.mapping.least_squares import solve_pose_graph
 from neuroslam.merging.consistency import link_sigmas
 from neuroslam.merging.match import find_match
+from neuroslam.merging.shape import misshapen
 from neuroslam.shared_map.journal import Entry, Layout
 from neuroslam.shared_map.messages import decode
 from neuroslam.shared_map.records import Piece, Records
-from neuroslam.state.match import Pairs
 from neuroslam.state.sessions import Session, session_name
 from neuroslam.threads import limit_threads, usable_threads
 from neuroslam.view.search import template_blocks
@@ -48,10 +48,8 @@ LEAST_PLACES = 3
 """Places from which a piece is tried: fewer cannot be confirmed."""
 
 SHAPE = 0.05
-"""Largest deviation of the shapes of a common path, as a share of its extent; see `misshapen`."""
-
-LEAST_EXTENT = 4.0
-"""Extent of a common path that confirms a robot's odometry, in sizes of an experience."""
+"""Largest deviation of the shapes of a common path, as a share of its extent: among robots a noisy
+one must not be excused by its own noise. See :mod:`neuroslam.merging.shape`."""
 
 MOST_LAYOUT_BYTES = 2**28
 
@@ -193,7 +191,10 @@ def _merged(group: _Group, one: _Group, refused: _Refused) -> _Group | None:
     found = find_match(group.brain, one.brain)
     reason = found.reason
     if found.match is not None:
-        reason = misshapen(group.brain, one.brain, found.match.pairs)
+        reason = misshapen(
+            group.brain.map, one.brain.map, found.match.pairs, one.brain.config,
+            shape=SHAPE, strict=True,
+        )  # fmt: skip
     if found.match is not None and not reason:
         brain, report = group.brain.merge(one.brain, found.match)
         reason = report.reason
@@ -207,49 +208,6 @@ def _merged(group: _Group, one: _Group, refused: _Refused) -> _Group | None:
             more = f" and {len(robots) - 3} more" if len(robots) > 3 else ""
             refused[piece] = len(robots), f"with {', '.join(robots[:3])}{more}: {reason}"
     return None
-
-
-def misshapen(group: NavigationBrain, one: NavigationBrain, pairs: Pairs) -> str:
-    r"""Return why the common path shows that the odometry of a map is not to be relied on.
-
-    The matched places :math:`x_i` of one map, aligned rigidly with :math:`y_i` of the other, must
-    have one shape,
-
-    .. math:: \sqrt{\tfrac1n \sum_i \lVert R x_i + t - y_i \rVert^2} \le \tfrac12 p + 0.05\, L
-
-    with :math:`p` the size of an experience and :math:`L` the RMS distance of :math:`y_i` from
-    their mean. The test of the residuals allows for the noise that the loop closures of a map show;
-    among robots a noisy one must not be excused by its own noise.
-
-    Args:
-        group: Map of a group.
-        one: Map that is to be merged into it.
-        pairs: Their matched places.
-
-    Returns:
-        The reason; empty if the shapes agree.
-    """
-    cells = one.config.pose_cells
-    size_m = cells.create_threshold_cells * cells.cell_size_m
-    there = group.map.poses[pairs.loaded, :2]
-    here = one.map.poses[pairs.partial, :2]
-    there, here = there - there.mean(axis=0), here - here.mean(axis=0)
-    cross = (here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]).sum()
-    moved = rotate_points(here, np.full(len(here), np.arctan2(cross, (here * there).sum())))
-    extent_m = float(np.sqrt(np.mean(np.sum(there**2, axis=1))))
-    rms_m = float(np.sqrt(np.mean(np.sum((moved - there) ** 2, axis=1))))
-    if extent_m < LEAST_EXTENT * size_m:
-        return (
-            f"the common path extends {extent_m:.1f} m (RMS); expected {LEAST_EXTENT * size_m:.1f} "
-            "m, to see whether the odometry of both agrees; drive more of it"
-        )
-    limit_m = 0.5 * size_m + SHAPE * extent_m
-    if rms_m <= limit_m:
-        return ""
-    return (
-        f"the common path has another shape on the two maps: {rms_m:.2f} m apart (RMS) over "
-        f"{extent_m:.1f} m; expected at most {limit_m:.2f} m: the odometry of one robot is wrong"
-    )
 
 
 def _row(piece: Piece, reason: str) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Rendered worlds whose places look the same: rooms in a row, wallpaper, a loop of equal corners.
 
 Each has one mark only by which its places can be distinguished; a world without any could not be
-localised in by anyone.
+localised in by anyone. With another ``mark`` the world is a second building that differs from the
+first in that alone.
 """
 
 import math
@@ -69,7 +70,7 @@ def _repeated(tile: np.ndarray, across: int, up: int = 1) -> np.ndarray:
     return np.ascontiguousarray(np.tile(tile, (up, across, 1)))
 
 
-def rooms(look: int) -> World:
+def rooms(look: int, mark: int | None = None) -> World:
     """Six rooms in a row, identical but for the wall of one end; there and back is 45 m a lap."""
     site, height, half = Site(look + 6000), 2.6, 2.0
     width = N_ROOMS * ROOM_M
@@ -84,7 +85,7 @@ def rooms(look: int) -> World:
         for low, high in zip(jambs[::2], jambs[1::2], strict=True):
             site.wall([(ROOM_M * k, high), (ROOM_M * k, low)], west)  # seen on the way east
             site.wall([(ROOM_M * k, low), (ROOM_M * k, high)], east)
-    site.wall([(width, half), (width, -half)], _mark(look, height))
+    site.wall([(width, half), (width, -half)], _mark(look if mark is None else mark, height))
     site.wall([(0.0, -half), (0.0, half)], east)
     ground = paint_outdoors.floor(site.rng, ROOM_M, 2 * half, _PER_M, "parquet").image
     lights = paint_outdoors.lamps(site.rng, ROOM_M, 2 * half, 32.0).image
@@ -100,7 +101,7 @@ def rooms(look: int) -> World:
     )
 
 
-def wallpaper(look: int) -> World:
+def wallpaper(look: int, mark: int | None = None) -> World:
     """Corridor of 20 m with one wallpaper everywhere and a mark at one end; 38 m a lap."""
     site, height, half, length = Site(look + 7000), 2.6, 1.6, 20.0
     rng = np.random.default_rng([look, 5])
@@ -115,7 +116,7 @@ def wallpaper(look: int) -> World:
 
     site.wall([(0.0, half), (length, half)], paper)
     site.wall([(length, -half), (0.0, -half)], paper)
-    site.wall([(length, half), (length, -half)], _mark(look, height))
+    site.wall([(length, half), (length, -half)], _mark(look if mark is None else mark, height))
     site.wall([(0.0, -half), (0.0, half)], paper)
     ground = paint_outdoors.floor(site.rng, MOTIF_M, 2 * half, _PER_M, "carpet").image
     white = np.full((32, 32, 3), 214, dtype=np.uint8)
@@ -131,18 +132,19 @@ def wallpaper(look: int) -> World:
     )
 
 
-def corners(look: int) -> World:
+def corners(look: int, mark: int | None = None) -> World:
     """Square corridor of four identical sides and corners, with a mark at one; 28 m a lap."""
     site, height = Site(look + 8000), 2.6
     outside, inside = 0.5 * SIDE_M + 1.2, 0.5 * SIDE_M - 1.2
-    ends, middle, mark = _same(look, 6, height), _same(look, 8, height), _mark(look, height)
+    ends, middle = _same(look, 6, height), _same(look, 8, height)
+    marked = _mark(look if mark is None else mark, height)
     for k in range(4):  # clockwise: each side begins and ends in a corner
         turn = [(-outside, -outside), (-outside, outside), (outside, outside), (outside, -outside)]
         (x0, y0), (x1, y1) = turn[k], turn[(k + 1) % 4]
         cuts = [(x0 + (x1 - x0) * t, y0 + (y1 - y0) * t) for t in (0.0, 0.25, 0.75, 1.0)]
-        site.wall(cuts[0:2], mark if k == 2 else ends)
+        site.wall(cuts[0:2], marked if k == 2 else ends)
         site.wall(cuts[1:3], middle)
-        site.wall(cuts[2:4], mark if k == 1 else ends)
+        site.wall(cuts[2:4], marked if k == 1 else ends)
     site.wall(_square(inside), _same(look, 7, height))
     size = 2 * outside
     ground = paint_outdoors.floor(site.rng, size, size, _PER_M, "tiles").image
