@@ -33,6 +33,7 @@ from neuroslam.mapping.overlap import n_places
 from neuroslam.mapping.tables import Links
 from neuroslam.merging.distinctness import CHANCE, Distinctness, distinctness
 from neuroslam.merging.mapped import Mapped
+from neuroslam.merging.shape import misshapen
 from neuroslam.state.match import Pairs
 from neuroslam.types import Pose
 
@@ -271,7 +272,9 @@ def weakness(loaded: Mapped, partial: Mapped, pairs: Pairs, result: Consistency)
         solved = result.loaded, result.partial
         found = distinctness(loaded, partial, solved, kept, contradicted)
         if found.coincidence > partial.config.sessions.coincidence:
-            return _not_distinct(found, partial.config)
+            # Maps of other scales do not lie on each other: one place seems to be several.
+            bent = misshapen(loaded.map, partial.map, kept, partial.config)
+            return bent or _not_distinct(found, partial.config)
     return inconsistency(result)
 
 
