@@ -1,38 +1,27 @@
 """Pose cells: an attractor over x, y and heading, moved by odometry and corrected by views."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Self, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from neuroslam.cells.attractor import (
-    Couplings,
-    advance,
-    couplings,
-    decode,
-    decode_window,
-    heading_table,
-    inject,
-    inject_window,
     path_integrate,
-    settle,
-    silenced,
 )
-from neuroslam.cells.convolve import Cell, Kernels, Packet, gaussian_difference, to_dense, to_packet
+from neuroslam.cells.convolve import Packet
 from neuroslam.cells.pose_joining import move_session
-from neuroslam.cells.side_by_side import decode_all, move_all, to_packets, to_tori, trim_all
-from neuroslam.compiled import runs_compiled
+from neuroslam.cells.side_by_side import move_all
+from neuroslam.cells.torus import Torus
 from neuroslam.config import BrainConfig, PoseCellConfig
 from neuroslam.errors import MapError, listed
 from neuroslam.geometry import TWO_PI
 from neuroslam.state.join import Join, MovedCells
 from neuroslam.state.match import Match
 from neuroslam.state.mergeable import State, renamed
-from neuroslam.state.pickling import Calls
 from neuroslam.state.population import (
     Belief,
     Correction,
@@ -53,38 +42,18 @@ SATURATED_DECAY = math.log(30.0) / 1.2
 _SUM_TOLERANCE = {"float32": 1e-4, "float64": 1e-9}
 
 
-@dataclass
-class _Now:
-    packet: Packet
-    slip: list[float] | Tensor  # lag of the estimate behind odometry in cells: x, y, theta
-    estimate: PoseEstimate | Tensor | None = None  # of the packet, once it was decoded
-    injected: bool = False  # since the last step
-    flat: tuple[Packet, np.ndarray, Cell] | None = None  # a packet, as compiled steps gave it
-
-
 def _no_slip(like: Tensor) -> list[float] | Tensor:
     return [0.0, 0.0, 0.0] if like.dim() == 1 else torch.zeros_like(like)
 
 
-def _flat(now: _Now) -> tuple[np.ndarray, Cell, Cell, Cell]:
-    """Return values, sizes, origin and torus for a compiled step."""
-    packet = now.packet
-    if now.flat is not None and now.flat[0] is packet:
-        return now.flat[1], now.flat[2], cast(Cell, packet.origin), packet.shape
-    values = packet.values.numpy()
-    a, b, c = values.shape
-    flat = values.reshape(-1).astype(np.float64)
-    return flat, (a, b, c), cast(Cell, packet.origin), packet.shape
-
-
-def _window(values: np.ndarray, sizes: Cell, origin: Cell, like: Packet) -> Packet:
-    """Make a packet of a compiled step's flat window."""
-    window = torch.from_numpy(values.reshape(sizes)).to(like.values.dtype)
-    return Packet(window, origin, like.shape)
+@dataclass
+class _Now:
+    slip: list[float] | Tensor  # lag of the estimate behind odometry in cells: x, y, theta
+    injected: bool = False  # since the last step
 
 
 @register("pose")
-class PoseCellNetwork(Population):
+class PoseCellNetwork(Torus, Population):
     """Continuous attractor on the torus ``(n_theta, n_xy, n_xy)``; a packet encodes the pose.
 
     :func:`~neuroslam.cells.attractor.settle` and
@@ -111,8 +80,6 @@ class PoseCellNetwork(Population):
     relaxes_map = True
     needs_views = True
 
-    window: Tensor
-    origin: Tensor
     slip: Tensor
 
     @classmethod
@@ -122,89 +89,31 @@ class PoseCellNetwork(Population):
 
     def __init__(self, config: PoseCellConfig, batch: int | None = None) -> None:
         super().__init__()
-        self.config = config
-        self.batch = batch
-        self.shape = (config.n_theta, config.n_xy, config.n_xy)
+        c = config
+        factors = (
+            [(c.excite_size, c.excite_std_theta), *2 * [(c.excite_size, c.excite_std_xy)]],
+            [(c.inhibit_size, c.inhibit_std_theta), *2 * [(c.inhibit_size, c.inhibit_std_xy)]],
+        )
+        self._set_up(config, batch, (c.n_theta, c.n_xy, c.n_xy), factors)
         dtype = getattr(torch, config.precision)
         self.bindings = GrowingTable(
             {name: ((), torch.float64) for name in ("x", "y", "theta")} | {"decay": ((), dtype)}
         )
-        self.register_buffer("window", torch.ones(1, 1, 1, dtype=dtype))
-        brains = () if batch is None else (batch,)
-        self.register_buffer("origin", torch.zeros(*brains, 3, dtype=torch.int64))
         self.last = Scalars(view=NO_TEMPLATE)
+        brains = () if batch is None else (batch,)
         slip = torch.zeros(*brains, 3, dtype=torch.float64)
         self.register_buffer("slip", slip)
-        self._couplings: dict[tuple[int, int, int], Couplings] = {}
-        self._loops: tuple[np.ndarray, ...] | None = None  # kernels and headings of compiled steps
-        # The state in use is here: writing buffers in each step would cost more than the cells.
-        self._now = _Now(Packet(self.window, (0, 0, 0), self.shape), slip)
-        self.register_state_dict_pre_hook(Calls("_write_buffers"))
-        self.register_load_state_dict_pre_hook(_take_window_size)
-        self.register_load_state_dict_post_hook(Calls("_read_buffers"))
+        self._now = _Now(slip)
         self.reset()
 
-    def reset(self) -> None:
-        """Set all activity into the middle cell, as at the start of a session: heading along -x."""
-        dense = self.window.new_zeros((() if self.batch is None else (self.batch,)) + self.shape)
-        dense[..., self.shape[0] // 2, self.shape[1] // 2, self.shape[2] // 2] = 1.0
-        self.activity = dense
-
-    @property
-    def kernels(self) -> tuple[Kernels, Kernels]:
-        """Excitation and inhibition kernels: the 1-D factors for theta, y and x."""
-        c = self.config
-        made = gaussian_difference(
-            [(c.excite_size, c.excite_std_theta)] + 2 * [(c.excite_size, c.excite_std_xy)],
-            [(c.inhibit_size, c.inhibit_std_theta)] + 2 * [(c.inhibit_size, c.inhibit_std_xy)],
-        )
-        return cast(Kernels, made.excite), cast(Kernels, made.inhibit)
-
-    @property
-    def packet(self) -> Packet:
-        """The active window and its origin on the torus."""
-        return self._now.packet
-
-    @packet.setter
-    def packet(self, packet: Packet) -> None:
-        self._now.packet = packet
-        self._now.estimate = None
-
-    @property
-    def activity(self) -> Tensor:
-        """Activity of all cells, shape ``([batch,] n_theta, n_y, n_x)``, non-negative, sum 1."""
-        return (to_dense if self.batch is None else to_tori)(self.packet)
-
-    @activity.setter
-    def activity(self, activity: Tensor) -> None:
-        expected = (() if self.batch is None else (self.batch,)) + self.shape
-        if tuple(activity.shape) != expected:
-            raise MapError(
-                f"PoseCellNetwork: activity has shape {tuple(activity.shape)}, expected {expected}"
-            )
-        convert = to_packet if self.batch is None else to_packets
-        self.packet = convert(activity.to(self.window))
+    def _set_activity(self, activity: Tensor) -> None:
+        super()._set_activity(activity)
         self._now.slip = _no_slip(self.slip)
 
     @property
     def estimate(self) -> PoseEstimate | Tensor:
         """Centre of the dominant packet in cells; in a batch x, y, theta, shape ``(batch, 3)``."""
-        if self._now.estimate is None:
-            self._now.estimate = self._decoded()
-        return self._now.estimate
-
-    def _decoded(self) -> PoseEstimate | Tensor:
-        packet, radius = self._now.packet, self.config.decode_radius
-        if self.batch is not None:
-            return decode_all(packet, radius)
-        if not runs_compiled(packet.values):
-            return decode(packet, radius)
-        return PoseEstimate(*decode_window(*_flat(self._now), radius))
-
-    @property
-    def peak(self) -> float:
-        """Activity of the most active cell: near 0 if the activity is spread out."""
-        return self.packet.values.max().item()
+        return self.centre
 
     def integrate(self, motion: Motion) -> PoseEstimate | Tensor:
         """Settle the attractor, move its activity by ``motion`` and return the estimate.
@@ -224,53 +133,16 @@ class PoseCellNetwork(Population):
             now.injected = False
         before = self.estimate if follows else None
         if self.batch is None:
-            self._move_one(distance, turn)
+            x, y, theta = cast(list[float], now.slip)
+            self._move(distance, turn + theta, (x, y))
             if follows:
                 self._measure_slip(cast(PoseEstimate, before), distance, turn)
         else:
-            settled, slip = trim_all(self._settled()), cast(Tensor, now.slip)
-            self.packet = move_all(settled, distance, turn + slip[:, 2], slip[:, :2])
+            slip = cast(Tensor, now.slip)
+            self._move_all(distance, turn + slip[:, 2], slip[:, :2])
             if follows:
                 self._measure_slips(cast(Tensor, before), distance, turn)
         return self.estimate
-
-    def _move_one(self, distance: float, turn: float) -> None:
-        """Settle and move the activity of one brain, with the slip that is fed back."""
-        c, now = self.config, self._now
-        x, y, theta = cast(list[float], now.slip)
-        values = now.packet.values
-        if not runs_compiled(values) or isinstance(distance, Tensor):
-            self.packet = path_integrate(self._settled(), distance, turn + theta, (x, y))
-            return
-        if self._loops is None:
-            kernels = (np.stack([k.numpy() for k in made]) for made in self.kernels)
-            self._loops = (*kernels, heading_table(c.n_theta))
-        excite, inhibit, headings = self._loops
-        moved, sizes, origin, estimate = advance(
-            *_flat(now), excite, inhibit, c.global_inhibition, distance, turn + theta,
-            (x, y), headings, c.decode_radius, c.precision == "float32",
-        )  # fmt: skip
-        if not moved.size:
-            raise silenced(c.global_inhibition)
-        now.packet = packet = _window(moved, sizes, origin, now.packet)
-        now.flat = packet, moved, sizes
-        now.estimate = PoseEstimate(*estimate)
-
-    def _settled(self) -> Packet:
-        """Excite, inhibit and normalise the activity."""
-        c, packet = self.config, self._now.packet
-        a, b, width = packet.values.shape[-3:]
-        sizes = (a, b, width)
-        coupled = self._couplings.get(sizes)
-        if coupled is None:
-            with torch.inference_mode(mode=False):  # kept for steps that may want gradients
-                made = couplings(*self.kernels, sizes, self.shape)
-                coupled = Couplings(
-                    *(m.to(device=self.window.device, dtype=self.window.dtype) for m in made)
-                )
-            self._couplings[sizes] = coupled
-        half = c.excite_size // 2
-        return settle(packet, coupled, (half, half, half), c.global_inhibition)
 
     def nudge(self, dx_cells: float, dy_cells: float, turn_cells: float) -> None:
         """Move and rotate the activity by a correction of the pose."""
@@ -367,12 +239,7 @@ class PoseCellNetwork(Population):
         )
         if c.inject_at_cell:
             at = PoseEstimate(*(math.floor(value) for value in at))
-        packet = self.packet
-        if runs_compiled(packet.values):
-            where = (float(at.theta), float(at.y), float(at.x))
-            self.packet = _window(*inject_window(*_flat(self._now), where, energy), packet)
-        else:
-            self.packet = inject(packet, at, energy)
+        self._inject(at, energy)
         self._now.injected = True
 
     def relocalise(self, view: ViewMatch) -> None:
@@ -516,31 +383,9 @@ class PoseCellNetwork(Population):
                 yield f"{name}: rows {listed(rows)} are not on the torus of {torus}"
 
     def _write_buffers(self) -> None:
-        packet, slip = self._now.packet, self._now.slip
-        self.window = packet.values
-        if self.batch is None:
-            self.origin = torch.tensor(packet.origin)
-            self.slip = torch.tensor(slip, dtype=torch.float64)
-        else:
-            self.origin, self.slip = cast(Tensor, packet.origin), cast(Tensor, slip)
+        super()._write_buffers()
+        self.slip = torch.as_tensor(self._now.slip, dtype=torch.float64)
 
     def _read_buffers(self) -> None:
-        one = self.batch is None
-        origin = tuple(self.origin.tolist()) if one else self.origin
-        slip = self.slip.tolist() if one else self.slip
-        self._now = _Now(Packet(self.window, origin, self.shape), slip)
-
-    def _apply(self, fn: object, recurse: bool = True) -> "PoseCellNetwork":
-        self._couplings.clear()
-        self._write_buffers()
-        super()._apply(cast(Callable[..., Any], fn), recurse)
-        self._read_buffers()
-        return self
-
-
-def _take_window_size(
-    module: nn.Module, state: dict[str, Tensor], prefix: str, *_unused: object
-) -> None:
-    saved = state.get(prefix + "window")
-    if saved is not None:
-        module.window = cast(Tensor, module.window).new_empty(saved.shape)
+        super()._read_buffers()
+        self._now = _Now(self.slip.tolist() if self.batch is None else self.slip)

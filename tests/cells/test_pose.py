@@ -438,7 +438,7 @@ def test_a_motion_many_times_round_the_torus_moves_as_the_definition_says(speed,
         motion = Motion(speed * (1.0 - 1.7 * (k % 2)), 0.4, 0.05)
         ours.integrate(motion)
         with monkeypatch.context() as patch:
-            patch.setattr("neuroslam.cells.pose.runs_compiled", lambda *_: False)
+            patch.setattr("neuroslam.cells.torus.runs_compiled", lambda *_: False)
             defined.integrate(motion)
     found, expected = to_dense(ours.packet), to_dense(defined.packet)
     assert float(found.sum()) == pytest.approx(1.0, abs=1e-4)
