@@ -3,8 +3,9 @@ r"""How distinctive the places are by which two maps were matched.
 Views prove that two places are one only if places that look the same are rare. How rare, the two
 maps show themselves: in the frame of their match, :math:`m` places were seen (a place is as large
 as the distance at which views count as elsewhere), and at :math:`k` of them a view is within the
-threshold of one that was seen elsewhere. There are two kinds of buildings, and :math:`k` decides
-between them:
+threshold of one that was seen elsewhere: farther off than a place, and than ``sessions.drift`` of
+the path between the two, for odometry moves a place that is visited again. There are two kinds of
+buildings, and :math:`k` decides between them:
 
 .. math:: w = \frac{w_0 B_1}{w_0 B_1 + (1 - w_0) B_0}, \qquad B_1 = \frac{1}{m + 1}, \qquad
    B_0 = \binom{m}{k} \varepsilon^k (1 - \varepsilon)^{m - k}
@@ -128,17 +129,49 @@ def distinctness(
     """
     size_m = FAR * spacing_m((loaded.map, partial.map), partial.config)
     places = count_places(np.vstack(solved), size_m)
-    alike = _share_alike((loaded, partial), solved, size_m) * places + contradicted
+    alike = _share_alike((loaded, partial), solved, matched, size_m) * places + contradicted
     n = count_places(solved[1][np.unique(matched.partial)], size_m)
     alike = min(alike, float(places))
     return Distinctness(places, alike, n, coincidence(alike, places, n))
 
 
+class _Paths:
+    """Path lengths between experiences of two maps, by their matched pairs.
+
+    Args:
+        maps: Both.
+        matched: The pairs.
+    """
+
+    def __init__(self, maps: tuple[Mapped, Mapped], matched: Pairs) -> None:
+        self.maps, self.ends = maps, (matched.loaded, matched.partial)
+        self._known: dict[tuple[int, int], np.ndarray] = {}
+
+    def lengths_m(self, which: int, experience: int, to: int) -> np.ndarray:
+        """Return the path lengths from an experience to all of its own or of the other map."""
+        own = self._on_one(which, experience)
+        if to == which:
+            return own
+        nearest = int(np.argmin(own[self.ends[which]]))
+        there = self._on_one(to, int(self.ends[to][nearest]))
+        total: np.ndarray = there + own[self.ends[which][nearest]]
+        return total
+
+    def _on_one(self, which: int, experience: int) -> np.ndarray:
+        key = which, experience
+        if key not in self._known:
+            self._known[key] = self.maps[which].map.path_lengths_m(experience)
+        return self._known[key]
+
+
 def _share_alike(
-    maps: tuple[Mapped, Mapped], solved: tuple[np.ndarray, np.ndarray], size_m: float
+    maps: tuple[Mapped, Mapped],
+    solved: tuple[np.ndarray, np.ndarray],
+    matched: Pairs,
+    size_m: float,
 ) -> float:
     """Return the share of experiences with a view within the threshold of one elsewhere."""
-    threshold = maps[1].config.view.threshold
+    config, paths = maps[1].config, _Paths(maps, matched)
     known = [
         (which, experience, int(template))
         for which, one in enumerate(maps)
@@ -151,13 +184,13 @@ def _share_alike(
         which, experience, template = known[index]
         view = maps[which].view.stored_view(template)
         here = solved[which][experience, :2]
-        alike += any(
-            bool((view_errors(one, view)[_beyond(poses, here, size_m)] <= threshold).any())
-            for one, poses in zip(maps, solved, strict=True)
-        )
+        for to, poses in enumerate(solved):
+            off_m = np.hypot(poses[:, 0] - here[0], poses[:, 1] - here[1])
+            like = (off_m > size_m) & (view_errors(maps[to], view) <= config.view.threshold)
+            if not like.any():
+                continue
+            drift_m = config.sessions.drift * paths.lengths_m(which, experience, to)
+            if (off_m > np.maximum(size_m, drift_m))[like].any():
+                alike += 1
+                break
     return alike / max(len(chosen), 1)
-
-
-def _beyond(poses: np.ndarray, here: np.ndarray, size_m: float) -> np.ndarray:
-    far: np.ndarray = np.hypot(poses[:, 0] - here[0], poses[:, 1] - here[1]) > size_m
-    return far
