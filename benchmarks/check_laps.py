@@ -1,9 +1,9 @@
 """Where a run and the lap truth of a drive differ: which of them do the images support?
 
 ``python -m benchmarks.check_laps RUN FRAMES.tar LAPS.csv``. Lap truth (columns ``lap``, ``phase``)
-is made from images, too, and can be wrong. Both say which place of the first lap a frame shows. An
-affine transform of scale-invariant features (SIFT, Lowe 2004) decides, which neither of them uses:
-one place has at least ``LEAD`` more inliers, at about the same distance, or it is left open.
+is made from images, too, and can be wrong. Both say which place of the first lap a frame shows. A
+similarity transform of scale-invariant features (SIFT, Lowe 2004) decides, which neither of them
+uses: one place has at least ``LEAD`` more inliers, at about the same distance, or it is left open.
 """
 
 import csv
@@ -18,7 +18,7 @@ APART = 0.05  # of a lap: beyond it, two frames show different places
 FAR = 0.08
 LEAD = 4  # inliers
 SCALES = 0.8, 1.25  # of a frame at about the same distance
-FIRST, EVERY = 450, 5  # frames that are checked: after the first lap
+FIRST, EVERY = 450, 5  # checked frames; of the recordings of a track, the first lap is before them
 
 
 class Images:

@@ -562,8 +562,9 @@ class SessionConfig(Section):
         default=0.25,
         ge=0,
         le=1,
-        description="error of odometry allowed between two matched pairs, as a share of the "
-        "distance between them; larger: more pairs count as agreeing",
+        description="error of odometry allowed between two matched pairs, and between two visits "
+        "of one place, as a share of the path between them; larger: more pairs count as agreeing, "
+        "and fewer places as places that look the same",
     )
     turn_tolerance_deg: float = Field(
         default=30.0,

@@ -148,7 +148,10 @@ class _Paths:
         self._known: dict[tuple[int, int], np.ndarray] = {}
 
     def lengths_m(self, which: int, experience: int, to: int) -> np.ndarray:
-        """Return the path lengths from an experience to all of its own or of the other map."""
+        """Return the path lengths from an experience to all of its own or of the other map.
+
+        They are infinite where no path is known.
+        """
         own = self._on_one(which, experience)
         if to == which:
             return own
@@ -187,10 +190,11 @@ def _share_alike(
         for to, poses in enumerate(solved):
             off_m = np.hypot(poses[:, 0] - here[0], poses[:, 1] - here[1])
             like = (off_m > size_m) & (view_errors(maps[to], view) <= config.view.threshold)
-            if not like.any():
-                continue
-            drift_m = config.sessions.drift * paths.lengths_m(which, experience, to)
-            if (off_m > np.maximum(size_m, drift_m))[like].any():
+            if like.any():
+                path_m = paths.lengths_m(which, experience, to)
+                linked = np.isfinite(path_m)  # what no path explains is not the same place
+                like[linked] &= off_m[linked] > config.sessions.drift * path_m[linked]
+            if like.any():
                 alike += 1
                 break
     return alike / max(len(chosen), 1)

@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from neuroslam import NavigationBrain
 from neuroslam.config import build_config
-from neuroslam.merging.distinctness import coincidence, count_places
+from neuroslam.mapping.planning import shortest_path_lengths
+from neuroslam.merging.distinctness import coincidence, count_places, distinctness
 from neuroslam.merging.match import find_match
 from neuroslam.merging.shape import LEAST_EXTENT, SHAPE, misshapen
 from neuroslam.runs.merge import join_brains
@@ -106,3 +108,30 @@ def test_the_shape_is_that_of_a_rigid_motion_and_short_paths_do_not_show_it(lap)
     cells = brain.config.pose_cells
     least = LEAST_EXTENT * cells.create_threshold_cells * cells.cell_size_m
     assert f"expected {least:.1f} m" in reason
+
+
+@pytest.mark.parametrize(("drift", "linked", "counts"), [
+    (0.25, True, False),  # odometry may have moved it on the way
+    (0.0, True, True),
+    (0.25, False, True),  # no path explains where it is
+])  # fmt: skip
+def test_a_revisit_that_odometry_moved_is_not_another_place(drift, linked, counts, lap):
+    brain, _ = lap
+    one, other = deepcopy(brain), deepcopy(brain)
+    other.config = build_config({"sessions": {"drift": drift}})
+    path_m, poses = brain.map.path_lengths_m(0), brain.map.poses
+    moved = poses + np.outer(0.15 * path_m, [0.0, 1.0, 0.0])
+    if not linked:
+        far = path_m > 0.5 * path_m.max()
+        for each in (one, other):
+            cut = far[each.map.links.source] != far[each.map.links.target]
+            each.map.path_lengths_m = partial(_path_lengths_without, each.map.links, cut)
+    ids = np.flatnonzero(path_m < 1.0)
+    pairs = Pairs(ids, ids.copy(), np.zeros(len(ids)), np.zeros(len(ids)))
+    assert distinctness(one, other, (poses, poses), pairs, 0).alike == 0.0
+    assert (distinctness(one, other, (poses, moved), pairs, 0).alike > 0.0) == counts
+
+
+def _path_lengths_without(links, left_out, start):
+    kept = tuple(column[~left_out] for column in links[:3])
+    return shortest_path_lengths(kept, int(links.target.max()) + 1, start)
