@@ -243,7 +243,7 @@ def test_of_two_runs_in_one_folder_one_is_refused(tmp_path):
     assert refusal.count("\n") == 1
     assert "another process is writing there" in refusal or "holds a run already" in refusal
     assert main(["verify", str(tmp_path / "both")]) == 0
-    assert Path(read_plan(tmp_path / "both").source) == logs[codes.index(0)]
+    assert Path(read_plan(tmp_path / "both").source) == logs[codes.index(0)].resolve()
 
 
 # --- what a killed process left -----------------------------------------------------------------
