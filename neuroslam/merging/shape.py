@@ -7,9 +7,12 @@ aligned rigidly with :math:`y_i` of the other, must have one shape,
 
 .. math:: \sqrt{\tfrac1n \sum_i \lVert R x_i + t - y_i \rVert^2} \le \tfrac12 p + \sigma L
 
-with :math:`p` the size of an experience and :math:`L` the RMS distance of :math:`y_i` from their
-mean. Maps that a wrong loop closure has bent are not judged by it.
+with :math:`p` the size of an experience and :math:`L` the RMS distance of the places from the mean
+of their map, over both maps, so that the order of the maps does not matter. Maps that a wrong loop
+closure has bent are not judged by it.
 """
+
+import math
 
 import numpy as np
 
@@ -50,7 +53,7 @@ def misshapen(
     cells = config.pose_cells
     size_m = cells.create_threshold_cells * cells.cell_size_m
     there, here = loaded.poses[pairs.loaded, :2], partial.poses[pairs.partial, :2]
-    extent_m = _extent(there)
+    extent_m = math.hypot(_extent(there), _extent(here)) / math.sqrt(2.0)
     if extent_m < LEAST_EXTENT * size_m:
         if not strict:
             return ""

@@ -97,6 +97,20 @@ def test_a_path_of_another_scale_has_another_shape(scale, right, lap):
     assert (misshapen(brain.map, other, pairs, brain.config) == "") == right
 
 
+def test_the_order_of_two_maps_does_not_change_whether_their_shapes_agree(lap):
+    brain, _ = lap
+    ids = np.arange(brain.map.n)
+    pairs = Pairs(ids, ids.copy(), np.zeros(len(ids)), np.zeros(len(ids)))
+    other, agree = deepcopy(brain.map), []
+    for scale in np.linspace(0.5, 2.0, 61):
+        other.experiences.array("pose")[:, :2] = scale * brain.map.poses[:, :2]
+        both = ((brain.map, other), (other, brain.map))
+        one, turned = (not misshapen(a, b, pairs, brain.config) for a, b in both)
+        assert one == turned, scale
+        agree.append(one)
+    assert set(agree) == {False, True}
+
+
 def test_the_shape_is_that_of_a_rigid_motion_and_short_paths_do_not_show_it(lap):
     brain, _ = lap
     ids = np.arange(brain.map.n)
